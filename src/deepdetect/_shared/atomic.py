@@ -1,4 +1,4 @@
-"""Files that appear whole under their final name, or not at all; folders for temporary files."""
+"""Atomic writing of files under temporary names, and folders for temporary files."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ ABANDONED_S = 24 * 3600.0
 """A temporary file of another machine is abandoned if it is older than this. Chosen by hand."""
 
 STEM_LENGTH = 40
-"""A temporary name, which must not be too long, has this number of characters of the final one."""
+"""A temporary name contains at most this many characters of the final name, which may be long."""
 
-# An owner is a machine, a process and a random number.
+# The owner in a temporary name is a machine, a process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
 
-# A temporary name is the stem, the owner, "part" and the suffix of the final file.
+# A temporary name has the stem of the final name, the owner, "part" and the final suffix.
 _TEMPORARY = re.compile(rf"\..*\.{_OWNER.pattern}\.part(\..*)?")
 
 
@@ -48,7 +48,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.touch(exist_ok=False)  # keeps the folder from being removed as empty
         yield temporary
         temporary.replace(final)
-    except DeepDetectError:  # one for a missing file is also an OSError
+    except DeepDetectError:  # the error for a missing file is also an OSError
         raise
     except OSError as error:
         raise DeepDetectError(
@@ -97,7 +97,7 @@ def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 
 def _has_ended(path: Path, machine: str, process: str) -> bool:
-    """Return whether a process has ended; on another machine or in a container, after a day."""
+    """Return whether a process has ended. On another machine, it counts as ended after a day."""
     try:
         if machine != _machine() or os.name != "posix":
             return time.time() - path.lstat().st_mtime > ABANDONED_S

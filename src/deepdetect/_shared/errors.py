@@ -149,7 +149,7 @@ def require_packages(what: str, *packages: str) -> None:
 
 @contextmanager
 def noted_failures(name: str, failures: list[str]) -> Iterator[None]:
-    """Note an error that concerns one of many inputs; raise an error that concerns all of them."""
+    """Note an error in the block that concerns one of many inputs; let others through."""
     try:
         yield
     except (MissingExtraError, WeightsError):

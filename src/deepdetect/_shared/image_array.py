@@ -14,10 +14,12 @@ Channels = Literal["rgb", "bgr"]
 CHANNEL_COUNTS = (1, 3, 4)
 
 SENSOR_BITS = (8, 10, 12, 14, 16)
-"""Bit depths of sensors with 16-bit files; the smallest one that holds an image is assumed."""
+"""Bit depths of sensors whose images are stored with 16 bits. The smallest depth that holds all
+values of an image is assumed."""
 
 LITTLE_RANGE = 1 / 8
-"""A warning follows if values use a smaller share of their range than this. Chosen by hand."""
+"""There is a warning if the values of an image fill less than this share of their range. Chosen by
+hand."""
 
 
 def check_channels(channels: str) -> None:
@@ -94,7 +96,7 @@ def to_8_bits(rgb: np.ndarray) -> np.ndarray:
 
 
 def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
-    """Write (H, W, 3) uint8 to larger (3, H, W) float32, repeating the last row and column."""
+    """Write (H, W, 3) pixels into larger (3, H', W') planes; repeat the last row and column."""
     below, right = planes.shape[1] - rgb.shape[0], planes.shape[2] - rgb.shape[1]
     if below or right:
         rgb = np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")

@@ -31,14 +31,15 @@ Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
 PARTS_PER_THREAD = 4
-"""Each thread gets this number of parts on average; one with easy parts takes more of them."""
+"""Average number of parts per thread. A thread whose parts are easy takes more of them."""
 
 TASKS_PER_WORKER = 8
 """`map_in_processes` submits this number of tasks per worker ahead, so that the others stay busy
 while it waits for the outcome of the first. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""A task has this time to end after the work was interrupted or failed; then it is killed."""
+"""Seconds that a running task has to end after the work was interrupted or failed, before it is
+killed."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables from which libraries take their number of threads when they are loaded."""
@@ -179,7 +180,7 @@ def start_child() -> None:
 
 
 def use_one_thread() -> None:
-    """Let OpenCV and `parallel_for` use one thread from now on, in one of many processes."""
+    """Let OpenCV and `parallel_for` use one thread in this process from now on."""
     global _max_threads
     cv2.setNumThreads(1)
     _max_threads = 1
@@ -199,8 +200,8 @@ def limited_threads(threads: int | None) -> Iterator[None]:
 def thread_limit() -> int | None:
     """Return how many threads this process may use, or None for a library's own number.
 
-    OMP_NUM_THREADS counts. ONNX Runtime binds its own number of threads to processors, the same in
-    every process, even if it may not use them. So each of several processes gets a number.
+    OMP_NUM_THREADS is respected. Worker processes, and processes that may not use all processors,
+    get a number: by default ONNX Runtime binds threads to the same processors in every process.
     """
     if chosen := getattr(_chosen, "threads", None):
         return int(chosen)
@@ -265,7 +266,7 @@ def available_memory() -> int:
 
 
 def needed_memory(**counts: float) -> float:
-    """Return the bytes that a step needs; `counts` are numbers of the items of `BYTES_PER`."""
+    """Return the bytes that a step needs for `counts` of items, named as in `BYTES_PER`."""
     return sum(BYTES_PER[name] * count for name, count in counts.items())
 
 

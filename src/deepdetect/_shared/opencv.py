@@ -18,7 +18,7 @@ from .errors import MissingExtraError, first_line, require_packages
 from .signals import sigterm_kept
 
 LOWEST_VERSION = "4.12"
-"""OpenCV writes the EXIF of an image from this version on."""
+"""Lowest supported version: older ones cannot write the EXIF of an image."""
 
 DISTRIBUTIONS = (
     "opencv-python",

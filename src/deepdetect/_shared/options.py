@@ -73,7 +73,8 @@ ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
 }
 """Types that are accepted for an annotation, including those of NumPy."""
 MADE_LATER = type(functools.cache(len))
-"""Type of a cached function, which can stand for keypoints that it makes at first use."""
+"""Type of cached functions. Such a function is accepted in place of keypoints, which it then makes
+at first use."""
 KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable, Mapping: Mapping}
 
 
@@ -95,7 +96,7 @@ def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
 
 
 def numbers_of(name: str, value: Any, kind: type | None, columns: int | None = None) -> np.ndarray:
-    """Return numbers as an array of a type, None for their own, in rows of `columns` if given.
+    """Return numbers as an array of a data type (None: unchanged), in rows of `columns` if given.
 
     Raises:
         OptionError: the value is not numeric, or has another shape.
@@ -117,7 +118,7 @@ def whole(name: str, value: Any) -> int:
 
 
 LARGEST = 1e38
-"""Options that must be finite, also in float32, are below this."""
+"""Limit of options that must be finite, so that they are also finite in float32."""
 
 
 def check_ranges(
@@ -131,8 +132,8 @@ def check_ranges(
 ) -> None:
     """Check the numbers in fields of options, also those in tuples; None always passes.
 
-    Fields are given by name: those above 0, from 0 on, in [0, 1], whole numbers from 1 on, and with
-    a smallest and largest value. If the default of a field is an int, its value must be whole.
+    The arguments name the fields that must be above 0, at least 0, in [0, 1], whole numbers from 1
+    on, or between two limits. If the default of a field is an int, its value must be whole.
 
     Raises:
         OptionError: a value is not a number, or out of its range.

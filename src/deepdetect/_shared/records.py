@@ -1,4 +1,4 @@
-"""Records of outputs: which inputs and options made them, are they complete, may they be replaced?
+"""Records of outputs: their inputs and options, whether they are complete or may be replaced.
 
 The record of an output is `.deepdetect/NAME.json` in its folder.
 """
@@ -190,7 +190,7 @@ class Outputs:
             for path, record, (state, content) in zip(self.paths, records, before, strict=True):
                 if file_state(path) == state:
                     _restore(record, content)
-            for folder in sorted(missing, reverse=True):  # the innermost first
+            for folder in sorted(missing, reverse=True):  # inner folders first
                 with contextlib.suppress(OSError):  # the folder is not empty
                     folder.rmdir()
             raise

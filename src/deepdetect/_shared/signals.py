@@ -77,7 +77,7 @@ def sigterm_kept() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Defer Ctrl-C while the block starts processes, in these until `end_worker_by_signals`."""
+    """Defer Ctrl-C in the block, and in its new processes until `end_worker_by_signals`."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -1,1 +1,1 @@
-"""The page in a browser, served on this computer, with tasks that run in Python."""
+"""A web page served on this computer only, for tasks that run in Python."""

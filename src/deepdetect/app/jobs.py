@@ -1,4 +1,4 @@
-"""Running tasks: each has a process and a folder, both removed when the page no longer asks."""
+"""Running tasks, each with a process and a folder. Both are removed when the page stops asking."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Job:
         self._reason = reason
         if self.process.pid is not None:
             kill_group(self.process.pid)
-        self.process.kill()  # on Windows, and as long as it has no group
+        self.process.kill()  # on Windows, or before it has made its group
         self._listener.join()
 
     def _listen(self) -> None:
@@ -168,7 +168,7 @@ class Jobs:
 def run_task(sender: Connection, order: Order) -> None:
     """Run a task in its own process: write files to `results`, and send states."""
     if hasattr(os, "setsid"):
-        os.setsid()  # a group, so that processes it starts can be ended
+        os.setsid()  # a group, to end its child processes as well
     for stream in (1, 2):  # discard what libraries print
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     end_with_parent(kill_group)

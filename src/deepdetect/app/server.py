@@ -49,17 +49,19 @@ STATIC = Path(__file__).parent / "static"
 
 CLOSE = {"Connection": "close"}
 SHUTDOWN_S = 1
-"""The server waits this long for running requests when it shuts down."""
+"""The server waits this many seconds for running requests when it shuts down."""
 
 CHECK_EVERY_S = 1.0
-"""Tasks that take too long or are abandoned are looked for at this interval."""
+"""Interval in seconds at which tasks that take too long, or are abandoned, are ended."""
 
 MAX_IMAGE_PIXELS = 2_100_000
-"""The page scales images to two megapixels, with sides that are multiples of 8."""
+"""Maximum number of pixels that a page may send. The page scales images to two megapixels, and then
+rounds their sides to multiples of 8."""
 
 POINT_BYTES = 12
 MAX_POINTS = 4000
-"""The page's slider allows this number of points, each of which is x, y and a size in float32."""
+"""Maximum number of points that the page's slider allows. The page sends x, y and a size in float32
+for each."""
 
 MIN_SIDE = 16
 MAX_DESCRIPTION_BYTES = 1 << 18
@@ -87,7 +89,8 @@ VIEWER_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "frame-ancestors 'self'; sandbox allow-scripts allow-downloads"
 )
-"""The viewer of a model is one file with an inline script, isolated from the page around it."""
+"""Content security policy for the viewer of a model: one file with an inline script, isolated from
+the page around it."""
 
 
 class AppServer:

@@ -31,10 +31,10 @@ from ..sfm.pipeline import reconstruct_many
 
 FOLDER_KEYPOINTS = 2048
 MODEL_STAGES = 9
-"""A 3D model takes at most this number of stages, including its files."""
+"""Maximum number of progress stages of a 3D model, including the writing of its files."""
 
 ASSUMED_FOCAL = 1.2
-"""Images without EXIF are given this multiple of the longer side as focal length, as in COLMAP."""
+"""Assumed focal length of images without EXIF, in units of the longer side, as in COLMAP."""
 
 Report = Callable[[str, int, int], None]
 """Function called with the stage that begins, the number of stages done, and their total (or 0)."""
@@ -257,7 +257,7 @@ def run_folder_keypoints(
 
 
 def _entry_name(name: str, others: Sequence[str]) -> str:
-    """Return a unique file name in the archive for an image, without folders.
+    """Return a file name without folders for an image's table, unique in the archive.
 
     Example:
         >>> _entry_name("a/b.jpg", []), _entry_name("../b", ["b.csv"])

@@ -67,9 +67,10 @@ COMMANDS = {
 """The commands of this package by group: the module of the function, and a summary."""
 
 LAB_ENTRY_POINTS = "deepdetect.commands"
-"""Group of the entry points by which deepdetect-lab adds commands, as tables such as `COMMANDS`.
+"""Group of the entry points by which deepdetect-lab adds commands, as tables like `COMMANDS` but
+with full names of modules.
 
-The entry point `dev` is the table of commands below `dev`. The tables have full module names.
+The entry point `dev` is the table of the commands `deepdetect dev NAME`.
 """
 
 LAB_COMMANDS = ("label", "train", "train-descriptor", "dev")
@@ -98,9 +99,10 @@ FORMATTER = HelpFormatter()
 
 @functools.cache
 def make_app(summaries: bool = False) -> App:
-    """Return the application, which imports the module of a command when it is called.
+    """Return the application, which imports the module of a command when the command is called.
 
-    With `summaries`, commands are listed with those of `COMMANDS`, otherwise with docstrings.
+    With `summaries`, the help lists commands with the summaries in `COMMANDS`, otherwise with their
+    docstrings.
     """
     commands, development = _all_commands()
     app = App(

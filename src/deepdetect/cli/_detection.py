@@ -46,10 +46,10 @@ def chosen_detector(
     options: From = POINTS,
     **defaults: Any,
 ) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
-    """Make the chosen detector and its selection; their options are removed from the values.
+    """Make the chosen detector and its selection options, and remove their options from the values.
 
-    `options` are the options of points. `max_keypoints` points and the `defaults` of the network
-    apply where the values give nothing else.
+    `options` are the options of points. If the values do not say otherwise, there are at most
+    `max_keypoints` points, and the network has the options `defaults`.
     """
     network, points, selection = (source.take(values) for source in (NETWORK, options, SELECTION))
     if kind == "points":

@@ -39,7 +39,8 @@ TEXT_WIDTH = 100
 class From:
     """Parameters of a function or class that become options of a command.
 
-    An option has the parameter's name, type and default, and the docstring's first sentence on it.
+    An option has the name, the type and the default of the parameter. Its help is the docstring's
+    first sentence about the parameter.
 
     Attributes:
         target: the function or class.
@@ -104,10 +105,12 @@ class Result:
     """The result of a command, which is printed when it returns.
 
     Attributes:
-        values: printed by --json; without a text the terminal shows them as a table.
+        values: the values that --json prints. If there is no text, the terminal shows them as a
+            table.
         text: output for the terminal: the most important facts, at most a dozen lines.
-        failures: a sentence about each input that failed; they give exit code 1.
-        total, what: number and kind of the inputs; the failure of a single one is the error.
+        failures: a sentence about each input that failed. If there are any, the exit code is 1.
+        total, what: number and kind of the inputs. If there is one input and it fails, its failure
+            is raised as the error.
         exit_code: exit code if nothing failed.
     """
 
@@ -251,14 +254,14 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
 
 @contextmanager
 def claimed(outputs: Outputs) -> Iterator[dict[str, Any]]:
-    """Write outputs as `Outputs.writing` does; signals that end the process also undo them."""
+    """Write outputs as `Outputs.writing` does, and also undo them if a signal ends the process."""
     with handle_signals(exit_by_signal), outputs.writing() as values:
         yield values
 
 
 @contextmanager
 def whole(files: Mapping[Any, Path]) -> Iterator[dict[Any, Path]]:
-    """Yield temporary paths for files: all files appear if the block succeeds, otherwise none."""
+    """Yield temporary paths, which get their final names only if the whole block succeeds."""
     with ExitStack() as stack:
         yield {name: stack.enter_context(atomic_path(path)) for name, path in files.items()}
 

@@ -59,7 +59,7 @@ def run_demo(
 ) -> dict[str, Any]:
     """Match a stereo pair, evaluate the matches, write visualisations, and return the numbers.
 
-    The same number of random points is matched by descriptors alone.
+    For comparison, the same number of random points is also matched, by descriptors alone.
 
     Args:
         left, right: (H, W, 3) uint8 RGB, rectified.

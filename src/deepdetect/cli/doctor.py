@@ -25,13 +25,15 @@ PURPOSES = {
     "sfm": "reconstruct of three images and more, extract, match-many, export, georeferences",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
-"""Probabilities of two back ends may differ by this much, which is five times the usual value."""
+"""Maximum difference between the probabilities of two back ends: five times the usual value."""
 TIMED_ROUNDS = 5
-"""The benchmark measures this many rounds, after one that loads and compiles. Chosen by hand."""
+"""The benchmark measures this many runs, after a first one that loads and compiles. Chosen by
+hand."""
 NEAR_SHIFT_PX = 16
-"""Disparity of the foreground in the self-test's second pair. Chosen by hand."""
+"""Disparity in pixels of the foreground in the second pair of the self-test. Chosen by hand."""
 MIN_PRECISION = 0.95
-"""The self-test needs this share of correct matches, which is 1 if all is well. Chosen by hand."""
+"""The self-test fails below this fraction of correct matches. On a working installation all are
+correct. Chosen by hand."""
 
 
 class Finding(NamedTuple):

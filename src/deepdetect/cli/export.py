@@ -146,7 +146,7 @@ def hloc(
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
-    """Return the file that marks a folder as ours; raise an OptionError for folders of others."""
+    """Return the file that marks a folder as our export; raise for other folders with files."""
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")

@@ -212,7 +212,7 @@ def _choose_pairs(
 
 
 def _why_none(matches: Matches, unguided: bool) -> str | None:
-    """Say why there are no matches, or no geometry."""
+    """Return a sentence that says why there are no matches, or no geometry."""
     if not len(matches) and (matches.success or unguided):
         return "there are no matches: the images have too little texture, or the options allow none"
     if matches.success:

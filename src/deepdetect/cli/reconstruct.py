@@ -50,7 +50,7 @@ MANY = cli.From(
     types={"control_points": Path | None},
 )
 WORKERS = cli.From(reconstruct_many, more="workers")
-"""Options that do not apply to two images."""
+"""Options of a reconstruction from more than two images that do not apply to two."""
 
 CHOSEN = replace(
     SELECTION,

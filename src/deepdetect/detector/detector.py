@@ -42,7 +42,7 @@ class Detector(Protocol):
 
 
 class HeatmapDetector(Protocol):
-    """Anything that gives a heat map from which keypoints can be selected."""
+    """Anything that computes heat maps, from which keypoints can be selected."""
 
     def heatmap(self, image: Any) -> np.ndarray:
         """Map an image to a (H, W) float32 probability of a keypoint."""
@@ -55,7 +55,7 @@ class DeepDetect:
     """The dense keypoint detector of the paper.
 
     Its keypoints are pixels of the network's heat map. If you want a few thousand keypoints,
-    `PointDetector` finds better ones than the best of these pixels, without the network.
+    `PointDetector` finds better ones than the most probable pixels, without the network.
 
     Args:
         weights: name of bundled weights ("default", "dense", "free" or "espnet"), or an ONNX file.
@@ -68,16 +68,16 @@ class DeepDetect:
         device: "cpu", "cuda", or the name of any execution provider of ONNX Runtime.
         threads: number of threads. None: the backend's choice.
         precision: number format of the network, "float32", or "bfloat16" with OpenVINO, which is
-            faster on processors with instructions for it; a few keypoints differ, and tiles are not
+            faster on processors with instructions for it. A few keypoints differ, and tiles are not
             available.
         network_channels: order of the colours in the network's input: "rgb", or "bgr" as in the
             paper's published code. For images of OpenCV keep "rgb", and call the methods with
             `channels="bgr"`.
         tta: "flip" averages over flips and quarter turns, so that a flipped or rotated image has
             the same keypoints, in eight times the time.
-        tile_megapixels: size of the tiles of larger images in megapixels, with resolution "native":
-            less memory, about twice the time. "auto": tiles only if memory is short. Only weights
-            of the network `fast` can be tiled.
+        tile_megapixels: size in megapixels of the tiles into which larger images are divided, with
+            resolution "native". Tiles take less memory and about twice the time. "auto": tiles only
+            if memory is short. Only weights of the network `fast` can be tiled.
 
     Attributes:
         backend: name of the backend in use.
@@ -142,7 +142,7 @@ class DeepDetect:
         return {name: value for name, value in vars(self).items() if name != "_network"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Another process opens the network again, by names that are the same on all machines.
+        # A pickled detector opens its network again, by names that are the same on all machines.
         vars(self).update(state, weights=resolve_weights(state["_portable"]))
         self._network, self.backend = open_network(self.weights, self._runtime)
 
@@ -154,7 +154,7 @@ class DeepDetect:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What its heat maps depend on besides the image: the weights' digest, and options."""
+        """Options and the digest of the weights: what heat maps depend on besides the image."""
         return {
             "detector": "network",
             "max_keypoints": self.max_keypoints,
@@ -200,8 +200,8 @@ class DeepDetect:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of its probabilities for one image.
 
-        Float32 rounds the highest probabilities to 1; logits still distinguish these pixels. From
-        both `select_keypoints` selects what `detect` finds, with any options.
+        Float32 rounds the highest probabilities to 1, but logits still rank these pixels. From the
+        two maps `select_keypoints` selects the keypoints that `detect` finds, with any options.
 
         Args:
             image, channels: see `heatmap`.
@@ -337,7 +337,7 @@ class DeepDetect:
 
 
 def check_selection(detector: AnyDetector, selection: SelectionOptions | None) -> None:
-    """Raise an OptionError if pixels are to be selected but the detector has no heat map."""
+    """Raise an OptionError if selection options are given for a detector without heat maps."""
     if selection is not None and not hasattr(detector, "heatmap"):
         raise OptionError(
             "`selection` needs a detector with a heat map: leave it out, or use a DeepDetect"
@@ -352,8 +352,8 @@ def find_keypoints(
 ) -> Keypoints:
     """Find the keypoints of a (H, W, 3) uint8 image, ranked by logits if it has any.
 
-    The detector may be any object with a method `heatmap` or `detect` like those of this package.
-    The selection applies to pixels of a heat map; None takes those above 0.5.
+    The detector may be any object with a method `heatmap` or `detect` like the detectors of this
+    package. The selection applies to heat maps. None selects pixels with a probability above 0.5.
     """
     check_selection(detector, selection)
     if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):

@@ -22,22 +22,23 @@ from .pretrained import STRIDE
 from .tiling import BYTES_PER_PIXEL, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
-"""The resolution "auto" keeps images up to this size: finer pixels mostly show blur and noise."""
+"""The resolution "auto" scales larger images down to this number of pixels, because finer pixels
+mostly show blur and noise."""
 
 RELEASE_PIXELS = 20_000_000
-"""Larger images release the network's memory before maps are computed; smaller ones need not."""
+"""The network's memory is released before the maps of images with more pixels are computed."""
 
 MIN_TILE_MEGAPIXELS = 1.5
-"""Smaller tiles would consist mostly of overlap."""
+"""Minimum size of a tile: smaller tiles would consist mostly of overlap."""
 
 Run = Callable[[np.ndarray], np.ndarray]
-"""Maps an image, (H, W, 3) uint8, to its (H, W) logits."""
+"""A function that maps an image, (H, W, 3) uint8, to its (H, W) logits."""
 
 
 @suggest_keywords
 @dataclass(frozen=True)
 class HeatmapOptions:
-    """How an image is prepared for the network: the options of `DeepDetect` of these names.
+    """How an image is prepared for the network. The fields are options of `DeepDetect`.
 
     Attributes:
         resolution: "native", a number of pixels, or "auto", which scales larger images down because
@@ -96,8 +97,8 @@ def compute_maps(
 ) -> Maps:
     """Run the network on a (H, W, 3) uint8 RGB image.
 
-    The maps have the image's own pixels; those of a scaled image are enlarged on access. A constant
-    image has nothing to detect: its map is 0.
+    The maps have the size of the image. If the image was scaled down for the network, they are
+    enlarged on access. The heat map of a constant image is 0.
     """
     shape = rgb.shape[:2]
     if all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape)):
@@ -113,7 +114,7 @@ def compute_maps(
 
 @contextmanager
 def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
-    """Turn lack of memory, during work on an image of this shape, into a clear error."""
+    """Replace a MemoryError in the block by an error that names the size of the image."""
     try:
         yield
     except Exception as error:
@@ -151,7 +152,7 @@ def _enlarged(logits: np.ndarray, shape: tuple[int, ...]) -> Maps:
 
 def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) -> Run | None:
     """Return a function that runs the network in tiles, or None if the image is run as a whole."""
-    path = getattr(network, "onnx_path", None)  # torch, bfloat16 and others cannot be tiled
+    path = getattr(network, "onnx_path", None)  # networks in torch or bfloat16 cannot be tiled
     area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
     most = available_memory() / BYTES_PER_PIXEL if area is None else area * 1e6
     if not is_native(shape, options) or shape[0] * shape[1] <= most:

@@ -55,8 +55,8 @@ class PointDetector:
             light, or a map; the ONNX file of `deepdetect train-descriptor`; or "rootsift", for
             programs that expect SIFT's. Or an object with a method `describe(image, keypoints)`
             that returns the keypoints with descriptors, as `PointDetector.describe` does.
-        backend, device, precision: for the same call as `DeepDetect`; points only run with ONNX
-            Runtime on the CPU in float32, and other values are errors.
+        backend, device, precision: arguments of `DeepDetect`. Points only run with ONNX Runtime on
+            the CPU in float32, and other values raise an error.
         threads: maximum number of threads. None: one per processor.
 
     Raises:
@@ -118,7 +118,7 @@ class PointDetector:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What its keypoints depend on besides the image: options, and the ranker's digest."""
+        """Options and the digest of the ranker: what keypoints depend on besides the image."""
         return {
             "detector": "points",
             "ranker": file_digest(self.ranker),
@@ -145,8 +145,8 @@ class PointDetector:
             channels: order of the colours in arrays and tensors: "rgb", or "bgr" as in OpenCV.
 
         Returns:
-            The keypoints, best first, with sub-pixel positions, sizes and angles. Their scores rank
-            them, but are not probabilities.
+            The keypoints, best first, with sub-pixel positions, sizes and angles. Scores rank the
+            keypoints, but are not probabilities.
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.

@@ -13,7 +13,7 @@ RANKER = Path(__file__).parent / "points" / "ranker.npz"
 """The trained ranker of points; for its card see MODEL_CARD.md in the same folder."""
 
 POINTS_GRAPH = RANKER.with_name("points.onnx")
-"""The whole detection of points as a graph, for ONNX files."""
+"""ONNX graph of the whole detection of points, for export."""
 
 PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
@@ -33,7 +33,7 @@ LOGITS = "logits"
 """Name of the output that holds logits; an output of another name holds probabilities."""
 
 POINTS = "keypoints", "scores", "sizes", "angles"
-"""Outputs of files that also give points; the package does not read them."""
+"""Names of further outputs of ONNX files with points. This package does not read these outputs."""
 
 
 def pretrained_weights(name: str = "default") -> Path:
@@ -42,7 +42,7 @@ def pretrained_weights(name: str = "default") -> Path:
 
 
 def resolve_weights(weights: str | Path) -> Path:
-    """Return the path of weights, which are named in `PRETRAINED` or are a file."""
+    """Return the path of weights, given by a name in `PRETRAINED` or as a file."""
     path = Path(weights) if names_a_file(weights) else pretrained_weights(str(weights))
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")

@@ -1,9 +1,9 @@
-"""The network `fast` in tiles, for images that are too large for the memory.
+"""Running the network `fast` in tiles, for images that are too large for the memory.
 
 The network uses a few numbers about the whole image: its exposure, and the means and maxima of the
-features. A first pass over the tiles collects these, a second one computes the logits. Tiles
-overlap by more than the convolutions see, so the logits are those of the whole image. (ESPNet
-cannot be tiled: its logits depend on pixels up to 1,738 px away.)
+features. A first pass over the tiles collects these numbers, and a second pass computes the logits.
+Tiles overlap by more than the receptive field of the convolutions, so the logits are the same as
+without tiles. (ESPNet cannot be tiled: its logits depend on pixels up to 1,738 px away.)
 """
 
 from __future__ import annotations
@@ -41,13 +41,14 @@ THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
 """Tensors at which the network is cut, as `export_onnx` names them; all have four dimensions."""
 
 SCALES = (4, 2, 1)
-"""The features have this many columns and rows for each stride of the image."""
+"""The features have this many columns and rows for each 8 pixels (`STRIDE`) of the image."""
 
 MARGIN = 4
-"""Tiles overlap their neighbours by this many strides: the convolutions see up to 28 px."""
+"""Each tile is enlarged by this many strides of 8 pixels on all sides, because the convolutions see
+up to 28 px."""
 
 BYTES_PER_PIXEL = 90
-"""Memory that a run of the whole image takes in either runtime, about."""
+"""Approximate memory per pixel, in bytes, that a run without tiles takes in either runtime."""
 
 DEFAULT_TILE_MEGAPIXELS = 2.7
 
@@ -56,11 +57,11 @@ Part = Callable[..., list[np.ndarray]]
 
 @dataclass(frozen=True)
 class TiledNetwork:
-    """A network in parts.
+    """A network cut into four parts.
 
-    `expose` maps the subsampled luma to its mean and the gain; `encode` maps an image and these to
-    features; `threshold` maps that luma, averages and maxima to the features' thresholds; `decode`
-    maps an image, mean, gain and thresholds to logits.
+    `expose` maps the subsampled luma to its mean and the gain. `encode` maps an image, mean and
+    gain to features. `threshold` maps the subsampled luma and the means and maxima of the features
+    to thresholds. `decode` maps an image, mean, gain and thresholds to logits.
     """
 
     expose: Part
@@ -69,7 +70,7 @@ class TiledNetwork:
     decode: Part
 
     def __call__(self, rgb: np.ndarray, tile_megapixels: float | None = None) -> np.ndarray:
-        """Compute the (H, W) float32 logits of (H, W, 3) uint8, in tiles of this size."""
+        """Compute the (H, W) float32 logits of an image, (H, W, 3) uint8, in tiles."""
         side = int((1e6 * (tile_megapixels or DEFAULT_TILE_MEGAPIXELS)) ** 0.5) // STRIDE
         height, width = (-(-length // STRIDE) for length in rgb.shape[:2])
         tiles = list(product(_spans(height, side), _spans(width, side)))
@@ -139,7 +140,7 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
 
 
 class _Span(NamedTuple):
-    """A part of a length in strides: `seen` is read, `core` written, `inner` is that in `seen`."""
+    """A tile on one axis, in strides: `seen` is read, `core` written, `inner` is core in seen."""
 
     seen: slice
     core: slice
@@ -147,7 +148,7 @@ class _Span(NamedTuple):
 
 
 def _spans(length: int, side: int) -> list[_Span]:
-    """Divide a length into as few equal parts as possible that fit a side with their margins."""
+    """Divide a length into the fewest equal parts that, with margins, are no longer than `side`."""
     count = 1
     while (core := -(-length // count)) + MARGIN * min(count - 1, 2) > side and core > MARGIN:
         count += 1

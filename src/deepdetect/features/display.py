@@ -14,10 +14,10 @@ from .._shared.image_array import Channels, array_to_rgb, deep_values
 from .._shared.opencv import cv2
 
 MAX_SIDE_PX = 240
-"""Longest side of the figure of an image in a table, in pixels: together they take about 10 kB."""
+"""Longest side, in pixels, of a figure in an HTML table. Table and figure take about 10 kB."""
 
 MAX_LINES = 60
-"""Number of matches that are drawn in that figure as lines. Chosen by hand."""
+"""Maximum number of matches drawn as lines in the figure of an HTML table. Chosen by hand."""
 
 Points = tuple[np.ndarray, tuple[int, int]]
 

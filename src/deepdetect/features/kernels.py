@@ -1,4 +1,4 @@
-"""Compiled parts of descriptors, orientations, matchers, nearest keypoints and suppression.
+"""Compiled functions for descriptors, orientations, matchers, nearest keypoints and suppression.
 
 Dense SIFT works in tiles, so that intermediate results stay in the processor's cache. Each pixel of
 a tile votes for eight soft orientations. These are summed along its row into the descriptor's four
@@ -21,30 +21,30 @@ TILE_HEIGHT = 96
 """Height of a tile in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
-"""Spans of taps are multiples of this number, which are summed in one go."""
+"""The length of a span of filter taps is a multiple of this number, which are summed in one go."""
 
 BINS = 36
 """Number of directions that gradients vote for, as in Lowe (2004)."""
 
 RADIUS_PER_WINDOW = 3.0
-"""Radius of the voting pixels relative to the sigma of their Gaussian window, as in OpenCV."""
+"""Radius within which pixels vote, in sigmas of the Gaussian window, as in OpenCV."""
 
 CHUNK = 64
-"""The minimum of every this many distances is stored, so that the nearest are found in one pass."""
+"""The minima of chunks of this many distances are stored, to find the nearest in one pass."""
 
 MIN_SQUARED_NORMS = 1e-3
-"""The product of both squared norms is limited to this from below: a descriptor may be the mean."""
+"""Minimum of the product of two squared norms: a descriptor that equals the mean has norm 0."""
 
 
 @compiled(nogil=True, fastmath=True)
 def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, taps, spans, out):  # type: ignore[no-untyped-def]
-    """Describe the keypoints of the tiles from `first` to before `last`, row by row, in `out`.
+    """Write the descriptors of the keypoints in tiles `first` to `last` (exclusive) into `out`.
 
-    The (H, W) float32 orientations are in units of 45 degrees. `rows_of` holds the row of `out` for
-    each point of the lattice, -1 without a keypoint; its first point is the pixel (x, y) `origin`.
-    `taps` are (4, T) weights of the T pixels around a keypoint for each of four bins, padded by
-    zeros. `spans`, (4, 3), holds the first tap and the end of those that are not 0, in whole groups
-    of `TAPS_AT_ONCE`, and T.
+    The (H, W) float32 orientations are in units of 45 degrees. `rows_of` holds, for each point of
+    the lattice, its row in `out`, or -1 without a keypoint. The first point of the lattice is the
+    pixel (x, y) `origin`. `taps`, (4, T), holds for each of four bins the weights of the T pixels
+    around a keypoint, padded by zeros. `spans`, (4, 3), holds for each bin the first tap, the end
+    of the nonzero taps in whole groups of `TAPS_AT_ONCE`, and T.
     """
     height, width = magnitude.shape
     reach = spans[0, 2] // 2
@@ -132,7 +132,7 @@ def _add(out, weights, a, b, c, d):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, fastmath=True, inline="always")
 def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
-    """Clip at a fifth of the norm, scale to 512 and round, as Lowe and OpenCV do."""
+    """Clip a descriptor at 0.2 of its norm, scale it to norm 512 and round, as in OpenCV."""
     total = np.float32(0)
     for b in range(4):
         for c in range(0, 4 * numbers, numbers):
@@ -154,10 +154,10 @@ def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
                 out[32 * b + 8 * c + o] = np.uint8(min(np.float32(255), value))
 
 
-# No full fastmath: with its approximate division and root equal descriptors do not give 0.
+# With full fastmath, division and root are approximate, so equal descriptors do not give 0.
 @compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
 def correlation_distances(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
-    """Write 1 - correlation of the pairs from `start` to before `stop` into `out`."""
+    """Write 1 - correlation of the descriptor pairs `start` to `stop` (exclusive) into `out`."""
     for k in range(start, stop):
         a, b = first[rows0[k]], second[rows1[k]]
         both = np.float32(0)
@@ -174,7 +174,7 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
 
 @compiled(nogil=True)
 def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
-    """Find the nearest of (M, 2) keypoints in the 3x3 pixels around positions, row by row.
+    """Find, for each position, the nearest of (M, 2) keypoints in the 3x3 pixels around it.
 
     `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. Nothing is written for
     positions that are not finite or have no keypoint near.
@@ -210,7 +210,7 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, inline="always")
 def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
-    """Return the best two rows and their distances after adding one row."""
+    """Return the two nearest rows and their distances after adding a candidate row."""
     if distance < nearer:
         return row, best, distance, nearer
     if distance < farther:
@@ -218,15 +218,15 @@ def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-un
     return best, second, nearer, farther
 
 
-# Assuming no NaN lets vector registers find minima.
+# If NaN cannot occur, vector instructions find minima.
 @compiled(nogil=True, fastmath={"nnan", "nsz"})
 def scan_products(products, terms0, terms1, start, rows, values, nearest, best, second):  # type: ignore[no-untyped-def]
-    """Find the nearest of the base to queries, and of the queries to the base, by their products.
+    """Find nearest neighbours in both directions between a block of queries and the base.
 
-    The squared distances of a block of queries, starting at number `start`, are `terms0[i] +
-    terms1[j] - 2 * products[i, j]`. Writes the (Q, K) nearest rows of the base, the lower ones of
-    equals, with their squared distances. For each of (M,) rows of the base it keeps the nearest
-    query so far, its squared distance and that of the second-nearest.
+    Squared distances are `terms0[i] + terms1[j] - 2 * products[i, j]`. The first query of the block
+    has the number `start`. For each query, the (Q, K) nearest rows of the base (the lower one of
+    equals) and their squared distances are written. For each of the M rows of the base, the nearest
+    query of all blocks so far and the squared distances of the two nearest queries are updated.
     """
     count = products.shape[1]
     chunks = (count + CHUNK - 1) // CHUNK
@@ -276,7 +276,7 @@ def _hash(number):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def patchmatch_start(first, last, queries, base, seed, rows, distances):  # type: ignore[no-untyped-def]
-    """Give the queries from `first` to before `last` two random rows of the base."""
+    """Give each of the queries `first` to `last` (exclusive) two random rows of the base."""
     count = len(base)
     for query in range(first, last):
         state = _hash(np.uint32(query) ^ _hash(np.uint32(seed)))
@@ -299,10 +299,11 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Improve the two best rows of the queries in some bands, one query after the other.
 
-    `bands` holds the first query of each band, in row-major order; `at0` and `at1` hold the row at
-    each pixel, or -1. `before` holds the rows before this sweep; it is read for other bands, so
-    that their order does not matter. Even turns go down, odd ones up. The matches of queries at
-    `offsets` are tried, and random ones within the `radii` around the best.
+    `bands` holds the first query of each band, in row-major order. `at0` and `at1` hold the row of
+    the keypoint at each pixel of the two images, or -1. `before` holds the matches before this
+    sweep. It is used for queries in other bands, so that the order of the bands does not matter.
+    Even sweeps (`turn`) go down, odd ones up. Two kinds of candidates are tried: the shifted
+    matches of queries at `offsets`, and random keypoints within `radii` around the best match.
     """
     (height0, width0), (height1, width1) = at0.shape, at1.shape
     direction = 1 - 2 * (turn % 2)
@@ -349,11 +350,11 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, error_model="numpy")
 def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignore[no-untyped-def]
-    """Find points, best first, that have no kept one closer than the smaller of their radii.
+    """Keep each point, best first, unless a kept one is closer than the smaller of their two radii.
 
-    Writes as many as there are, or as `kept` has room for, and returns their number. Positions are
-    not negative. Kept points are chained by square cells: `last` holds the last one of each cell,
-    `before` the previous one for each point; -1 means none.
+    Writes the rows of kept points into `kept` until it is full, and returns their number. Positions
+    must not be negative. The kept points of each square cell form a linked list: `last` holds the
+    last point of each cell, `before` the previous point of each point. -1 means none.
     """
     rows, count = len(last) // columns, 0
     for k in range(len(x)):
@@ -381,15 +382,15 @@ ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-"""Coefficients of OpenCV's arctangent, in degrees, so that votes go to the same bins."""
+"""Coefficients of OpenCV's arctangent, in degrees, so that votes go to the same bins as there."""
 
 
 @compiled(nogil=True, error_model="numpy")
 def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def]
     """Return the dominant gradient direction around (N, 2) pixels, (N,) float32 degrees.
 
-    Gradients vote for `BINS` directions, each weighted by a Gaussian window with one of (N,)
-    sigmas. The outermost pixels have no gradient.
+    Gradients vote for `BINS` directions, weighted by a Gaussian window. Each pixel has its own
+    sigma, (N,). The outermost pixels of the image have no gradient.
     """
     height, width = image.shape
     angles = np.zeros(len(pixels), np.float32)

@@ -15,7 +15,7 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Diameter of a SIFT keypoint per unit of its scale, for each meaning of the scale."""
+"""Diameter of a SIFT keypoint divided by its scale, if the scale means diameter or sigma."""
 
 MAX_COORDINATE_BITS = 12
 """`bayer_order` uses at most this many bits of a position: float32 then holds the order exactly."""
@@ -184,9 +184,9 @@ class Keypoints:
         coordinates are ours: the centre of the first pixel is (0, 0).
 
         Args:
-            scale: meaning of its scales: "diameter", as its own extractor takes them from OpenCV,
-                or "sigma", half of that, as it takes them from COLMAP and as kornia's
-                `LightGlueMatcher` does. Both authors' programs use the same weights.
+            scale: meaning of "scales": "diameter", as in LightGlue's own extractor for OpenCV, or
+                "sigma", half the diameter, as in its extractor for COLMAP and in kornia's
+                `LightGlueMatcher`. LightGlue and kornia use the same weights.
             size: diameter in pixels for keypoints without a size.
             angle: orientation in degrees for keypoints without an angle.
 
@@ -222,8 +222,8 @@ class Keypoints:
     def draw(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray:
         """Draw the keypoints on their image, which is dimmed.
 
-        They are drawn as circles of their sizes, by default three pixels; more than 5,000 are drawn
-        as single pixels.
+        A circle shows the size of a keypoint; without sizes all have three pixels. More than 5,000
+        keypoints are drawn as single pixels.
 
         Args:
             image: an array, a PyTorch tensor or a PIL image.
@@ -233,7 +233,7 @@ class Keypoints:
             (H, W, 3) uint8 RGB.
 
         Raises:
-            ImageError: the image has another size than the keypoints'.
+            ImageError: the size of the image differs from `image_size`.
         """
         from ..viz.draw import draw_keypoints
         from .display import checked_image
@@ -250,7 +250,7 @@ class Keypoints:
     def best(self, count: int) -> Keypoints:
         """Return the keypoints with the highest logits (or scores), in their present order.
 
-        Ties are broken by an order that spreads them evenly over the image.
+        Among equal values, the chosen keypoints are spread evenly over the image.
         """
         if len(self) <= (count := whole("count", count)):
             return self
@@ -259,7 +259,7 @@ class Keypoints:
         return self[np.sort(np.lexsort((order, -ranks))[:count])]
 
     def distinct(self) -> Keypoints:
-        """Return each position once, with its highest score: SIFT repeats some for other angles."""
+        """Keep the best keypoint of each position: SIFT repeats positions with several angles."""
         order = np.argsort(-self.scores, kind="stable")
         # Comparing both float32 as one number is ten times faster than rows; + 0 turns -0 into 0.
         keys = np.ascontiguousarray(self.xy[order] + np.float32(0)).view(np.uint64).ravel()
@@ -311,15 +311,15 @@ def unit_length(descriptors: np.ndarray) -> np.ndarray:
 
 
 def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Rank (N, 2) positions by ordered dithering: for any N, the first N are spread evenly.
+    """Rank (N, 2) positions by ordered dithering: any number of first ones is spread evenly.
 
-    The ranks are those of Bayer's matrix, without repetition over the image's (width, height), at
-    the nearest pixels: neighbours get distant ranks. They are (N,) float32 in [0, 1).
+    The ranks, (N,) float32 in [0, 1), are the values at the nearest pixels of a Bayer matrix that
+    is as large as the image of this (width, height). Neighbouring pixels get distant ranks.
     """
     column, row = np.rint(np.asarray(xy).reshape(-1, 2)).astype(np.int64).T
     bits = min(MAX_COORDINATE_BITS, max(1, (max(size) - 1).bit_length()))
     order = np.zeros(len(row), np.int64)
-    for _ in range(bits):  # the lowest bits of the position become the highest of the rank
+    for _ in range(bits):  # the lowest bits of the position become the highest bits of the rank
         order = 4 * order + 2 * ((column ^ row) & 1) + (row & 1)
         column, row = column >> 1, row >> 1
     return (order / 4**bits).astype(np.float32)
@@ -348,7 +348,7 @@ def nearest_keypoints(
 
 
 def on_pixels(xy: np.ndarray, shape: tuple[int, ...] | None = None) -> bool:
-    """Return whether all positions are whole pixels (of an image of this shape, if given)."""
+    """Return whether all positions are whole numbers and, if `shape` is given, inside the image."""
     xy = np.asarray(xy)
     inside = (xy >= 0).all() and (shape is None or (xy < (shape[1], shape[0])).all())
     return bool(inside and (xy == np.rint(xy)).all())

@@ -13,52 +13,55 @@ from .matchers import DescriptorMatches
 LEARNED: Final = "learned"
 LEARNED_FREE: Final = "learned-free"
 CROSS_MODAL: Final = "cross-modal"
-"""`Keypoints.descriptor_type` of learned descriptors. The second has weights from freely licensed
-photographs only. The third is for images of different sensors, where dark and bright may be
-swapped. Your own weights have "learned-" or "cross-modal-" and the start of their SHA-256."""
+"""Values of `Keypoints.descriptor_type` for learned descriptors. The weights of the second are
+trained on freely licensed photographs only. The third is for images of different sensors, where
+dark and bright may be swapped. For your own weights the type is "learned-" or "cross-modal-" and
+the start of their SHA-256."""
 
 RATIO, LEARNED_RATIO = 0.85, 0.88
-"""Ratio tests of other and of learned descriptors. On photos/val, learned ones at 0.88 are as
-precise as RootSIFT at 0.85, and match unrelated photographs no more often. At 0.93 they would be as
-precise, but match unrelated photographs four times as often."""
+"""Thresholds of the ratio test, the first for other and the second for learned descriptors. On
+photos/val, learned ones at 0.88 are as precise as RootSIFT at 0.85, and match unrelated photographs
+no more often. At 0.93 they match unrelated photographs four times as often."""
 
 LENGTH = 64
 
 CONSTANT = 16
-"""The first numbers of a descriptor, this many, do not change if the image is rotated."""
+"""The first 16 numbers of a descriptor do not change if the image is rotated."""
 
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
-"""The other numbers are the real and then the imaginary parts of complex ones. A rotation of the
-image by an angle rotates these by the angle times these factors."""
+"""The remaining 48 numbers of a descriptor are the real parts and then the imaginary parts of 24
+complex numbers. Rotating the image adds the angle, times the factor here, to each one's phase."""
 
 UPRIGHT_DEGREES = 15.0
-"""Smaller rotations need no correction: the network has learned to tolerate them."""
+"""Rotations below this angle are not corrected: the network has learned to tolerate them."""
 
 TURNED_KEYPOINTS = 512
-"""Number of best keypoints per image that determine the rotation between both. Chosen by hand."""
+"""The rotation between two images is found by this many best keypoints of each. Chosen by hand."""
 
 HISTOGRAM_DEGREES = 10
 NEAR_DEGREES = 20
-"""Width of the bins of angles; angles this near to the fullest bin are averaged. Chosen by hand."""
+"""The first is the width of the bins of a histogram of angles, the second the distance from the
+fullest bin within which the median is taken. Both are in degrees and were chosen by hand."""
 
 
 def is_learned(descriptor_type: str | None) -> bool:
-    """Return whether descriptors are learned, with bundled weights or your own."""
+    """Return whether descriptors of this type are learned, with bundled or your own weights."""
     return descriptor_type is not None and descriptor_type.startswith((LEARNED, CROSS_MODAL))
 
 
 def angles_counted(descriptor_type: str) -> int:
     """Return the multiple of a keypoint's angle by which its descriptor is rotated.
 
-    It is 2 between different sensors, where a gradient may point the opposite way.
+    It is 2 for cross-modal descriptors: between sensors a gradient may point the opposite way, and
+    doubled angles are equal for opposite directions.
     """
     return 2 if descriptor_type.startswith(CROSS_MODAL) else 1
 
 
 def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np.ndarray:
-    """Return (N, 64) float32 learned descriptors as those of a rotated image.
+    """Rotate (N, 64) float32 learned descriptors, as if the image were rotated.
 
-    The rotation is one angle or (N,), in degrees from the x axis towards the y axis.
+    The angle, one for all or (N,), is in degrees from the x axis towards the y axis.
     """
     real = CONSTANT + len(FREQUENCIES)
     once = np.exp(1j * np.radians(np.reshape(degrees, -1))).astype(np.complex64)
@@ -72,10 +75,11 @@ def match_learned(
     features1: Keypoints,
     match: Callable[[np.ndarray, np.ndarray], DescriptorMatches],
 ) -> DescriptorMatches:
-    """Match learned descriptors as upright ones, after undoing the rotation between the images.
+    """Match learned descriptors after undoing the rotation between the two images.
 
-    Descriptors at the keypoints' own angles tolerate any rotation, and reveal it. Upright ones,
-    which see how keypoints are rotated relative to each other, match about a sixth more.
+    Descriptors rotated to the keypoints' own angles match under any rotation, and their matches
+    tell the rotation between the images. Upright descriptors, of which only this common rotation
+    is undone, distinguish more, and give about a sixth more matches.
     """
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
     assert descriptors0 is not None
@@ -91,12 +95,12 @@ def match_learned(
     turned = match(first, turn_descriptors(descriptors1, angles1 - turn))
     if abs((turn + 180) % 360 - 180) < UPRIGHT_DEGREES:
         return turned
-    # If few match, the most frequent rotation is chance: no rotation is tried as well.
+    # If few descriptors match, the most frequent rotation is random, so 0 is tried as well.
     return max(match(first, turn_descriptors(descriptors1, angles1)), turned, key=len)
 
 
 def common_turn(degrees: np.ndarray) -> float:
-    """Return the most frequent of (N,) differences of angles, in degrees; 0 without any."""
+    """Return the most frequent of (N,) rotation angles, in degrees; 0 if there are none."""
     degrees = degrees % 360
     bins = np.bincount((degrees // HISTOGRAM_DEGREES).astype(int), minlength=36)
     fullest = int((bins + np.roll(bins, 1) + np.roll(bins, -1)).argmax())

@@ -1,9 +1,9 @@
-"""A filter for mutual nearest neighbours, by the matches around each of them.
+"""A filter of mutual nearest neighbours that compares each match with the matches around it.
 
-Correct matches move, rotate and grow as their neighbours do, wrong ones at random. A network of
-25,000 parameters (MATCH_FILTER_CARD.md) has learned how similar these changes are on surfaces that
-bend and move. It sees no descriptors, only their ratios, so it serves several types. It replaces
-the ratio test, which discards correct matches that have a rival.
+Correct matches move, rotate and change scale as their neighbours do, wrong matches at random. A
+network of 25,000 parameters (MATCH_FILTER_CARD.md) has learned how similar these changes are, also
+on surfaces that bend and move. Its input is Lowe's ratios but not the descriptors, so it suits
+several types. It replaces the ratio test, which discards correct matches on repeated structures.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ AROUND = 8
 """Each match is compared with this many nearest matches in either image: the network's input."""
 
 MOST_DISTINCT = 512
-"""Number of matches, of the lowest ratios, that determine the rotation. Chosen by hand."""
+"""Number of matches, those with the lowest ratios, that give the rotation. Chosen by hand."""
 
 FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
 """FLANN's tree for few dimensions, and its code for an exact search."""
@@ -44,7 +44,7 @@ def check_filter(filter_by: str, ratio: float | None, mutual: bool) -> None:
 def suits_filter(features: Keypoints) -> bool:
     """Return whether keypoints have sizes, angles and descriptors that the filter supports.
 
-    Cross-modal ones are not supported: inverted tones may rotate keypoints by half a turn.
+    Cross-modal descriptors are not supported: inverted tones rotate keypoints by 180 degrees.
     """
     kind, sizes, angles = features.descriptor_type, features.sizes, features.angles
     served = kind == ROOT_SIFT or (is_learned(kind) and not str(kind).startswith(CROSS_MODAL))
@@ -67,8 +67,9 @@ def filter_matches(
 ) -> DescriptorMatches:
     """Keep the mutual nearest neighbours that are more likely correct than wrong.
 
-    With `AROUND` matches or fewer none is kept: they have too few neighbours. The keypoints must
-    suit the filter. In the result the ratios are the network's probabilities of being wrong.
+    If there are at most `AROUND` matches, none is kept, because they have too few neighbours. The
+    keypoints must suit the filter. The `ratios` of the result are the probabilities, according to
+    the network, that a match is wrong.
     """
     if len(matches) <= AROUND:
         none = np.empty(0, np.int32)
@@ -108,11 +109,11 @@ def filter_inputs(
 
 
 def nearest_rows(xy: np.ndarray) -> np.ndarray:
-    """Return the (N, `AROUND`) rows of the nearest other positions, of which there are enough."""
+    """Return the (N, `AROUND`) rows of the nearest other positions, for N > `AROUND` positions."""
     own = np.arange(len(xy))[:, None]
     tree = cv2.flann_Index(xy, {"algorithm": FLANN_KDTREE_SINGLE, "leaf_max_size": 10})
     near = tree.knnSearch(xy, AROUND + 1, params={"checks": ALL_LEAVES})[0].astype(np.int64)
-    # A row itself is moved to the end. It is missing if many positions coincide.
+    # A position's own row goes to the end. It may be missing if many positions coincide.
     return np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]
 
 

@@ -22,35 +22,37 @@ from .._shared.runtimes import start_session
 from .keypoints import on_pixels
 
 BLOCK_SIZE = 2_000_000
-"""Exact search holds this many numbers of four bytes at a time: 8 MB, which most caches hold."""
+"""Exact search works on blocks of this many float32 numbers: 8 MB, which fit most caches."""
 
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
-"""Descriptors of bytes have exact distances in single precision up to this length."""
+"""Distances of uint8 descriptors up to this length are exact in single precision."""
 
 PRODUCTS = Path(__file__).with_name("products")
 """ONNX files of one matrix product each, made by `tools/product_graphs.py`. NumPy's product in
 single precision takes twice the time, and its threads keep processors busy afterwards."""
 
 MAX_EXACT_PRODUCT = 4e8
-"""All distances are computed up to this product of both numbers of keypoints. Chosen by hand."""
+"""The search is exact up to this product of both numbers of keypoints. Chosen by hand."""
 
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
-"""FLANN's index, number of trees and number of visited leaves, as in the paper's code."""
+"""FLANN's code for kd-trees, number of trees and of visited leaves, as in the paper's code."""
 
 SWEEPS = 4
 """PatchMatch makes this many sweeps over all queries, down and up in turn. Chosen by hand."""
 
 OFFSETS_PX = (1, 4, 12)
-"""Matches of queries at these distances are tried; dense keypoints are 1 px apart."""
+"""PatchMatch tries the matches of queries at these distances. Dense keypoints are 1 px apart."""
 
 BAND_HEIGHT_PX = 96
-"""One thread works on a band of this height, on which the result depends. Chosen by hand."""
+"""Height of the bands that PatchMatch gives to threads. The result depends on it, not on the number
+of threads. Chosen by hand."""
 
 SEARCH_SHRINK = 3
-"""Random tries start in the whole image around the best neighbour; radii shrink by this factor."""
+"""PatchMatch's random search around the best neighbour starts with the whole image as radius, and
+divides the radius by this from try to try."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
-"""(N, count) int32 rows and (N, count) float32 distances, nearest first."""
+"""Nearest neighbours of N queries: (N, count) int32 rows and float32 distances, nearest first."""
 
 Positions = tuple[np.ndarray, np.ndarray] | None
 """Keypoints of both images in pixels; None if their scales or angles differ, so that nearby
@@ -67,7 +69,7 @@ def exact_neighbours(
 ) -> Neighbours:
     """Find the exact nearest neighbours by matrix products; a `Matcher`. Ties go to the lower row.
 
-    The time grows with the product of both numbers: it suits tens of thousands of keypoints.
+    The time grows with the product of both numbers of keypoints: it suits tens of thousands.
     """
     return _search_both_ways(queries, base, count)[:2]
 
@@ -89,7 +91,7 @@ def _search_both_ways(
     else:
         queries, base = (np.asarray(part, np.float32) for part in (queries, base))
         session, factor = _product("float"), np.ascontiguousarray(base.T)
-    found = min(count + 1, len(base))  # one more: could rounding change the others?
+    found = min(count + 1, len(base))  # one more, to detect ties within rounding
     rows = np.empty((len(queries), found), np.int32)
     squared = np.empty((len(queries), found), np.float32)
     nearest = np.zeros(len(base), np.int32)
@@ -103,7 +105,7 @@ def _search_both_ways(
         scan_products(*block, rows[part], squared[part], nearest, best, second)
     if whole or not len(queries):
         return rows[:, :count], np.sqrt(squared[:, :count]), nearest
-    # Bounds of all rounding errors: in the sums of the product, and in the terms.
+    # Bounds of the rounding errors in the sums of the product, and in the terms.
     lengths = np.sqrt(terms0), np.sqrt(terms1)
     bound = (width / 2 + 8) * float(np.finfo(np.float32).eps)
     doubt = bound * (lengths[0] + lengths[1].max()) ** 2
@@ -146,8 +148,8 @@ def _product(name: str) -> Any:
 def _byte_product() -> tuple[Any, int]:
     """Return a session that multiplies bytes, and the offset to subtract from those of the base.
 
-    The fastest instructions take signed bytes on one side. On processors without VNNI the sums of
-    such instructions saturate; they get unsigned bytes.
+    The fastest instructions (VNNI) multiply unsigned by signed bytes. On processors without them,
+    sums of such products saturate, so both sides are unsigned.
     """
     session = _product("signed")
     most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
@@ -159,7 +161,7 @@ def _byte_product() -> tuple[Any, int]:
 def hamming_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
-    """Find nearest neighbours of binary descriptors (ORB, BRISK), by Hamming; a `Matcher`."""
+    """Find nearest neighbours of binary descriptors by Hamming distance; a `Matcher`."""
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
         raise OptionError("the matcher hamming compares binary descriptors: use exact or flann")
     if not len(queries):
@@ -179,9 +181,9 @@ def flann_neighbours(
     trees: int = TREES,
     checks: int = CHECKS,
 ) -> Neighbours:
-    """Find approximate nearest neighbours in random kd-trees; a `Matcher` otherwise.
+    """Find approximate nearest neighbours in random kd-trees, visiting `checks` leaves per query.
 
-    `checks` leaves are visited for each query.
+    The other arguments and the result are those of a `Matcher`.
     """
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
 
@@ -199,12 +201,12 @@ def flann_neighbours(
 def patchmatch_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
-    """Find one or two approximate nearest neighbours of each query by propagating good ones.
+    """Find one or two approximate nearest neighbours of each query by PatchMatch; a `Matcher`.
 
-    The match of a neighbouring query, shifted, is probably good (Barnes et al., "PatchMatch",
-    2009). On hundreds of thousands of dense keypoints it takes a twentieth of FLANN's time and
-    finds more correct matches; it does not suit few or scattered ones. It is a `Matcher` for
-    descriptors of bytes on whole pixels. The result does not depend on the number of threads.
+    The match of an adjacent query, shifted by the same distance, is probably good (Barnes et al.,
+    "PatchMatch", 2009). On hundreds of thousands of dense keypoints this takes a twentieth of
+    FLANN's time and finds more correct matches. It does not suit few or scattered keypoints.
+    Descriptors must be uint8 and keypoints on whole pixels. The number of threads has no effect.
     """
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(
@@ -248,9 +250,9 @@ def _grid(xy: np.ndarray) -> np.ndarray:
 def automatic_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
-    """Find neighbours exactly if keypoints are few, otherwise by PatchMatch or else FLANN.
+    """Find neighbours exactly if keypoints are few, otherwise by PatchMatch or FLANN.
 
-    PatchMatch needs descriptors of bytes and keypoints on whole pixels, of one scale and angle.
+    PatchMatch needs uint8 descriptors and keypoints on whole pixels, of one scale and angle.
     """
     if len(queries) * len(base) <= MAX_EXACT_PRODUCT:
         return exact_neighbours(queries, base, count, seed, positions)
@@ -303,11 +305,11 @@ def match_descriptors(
     seed: int = 0,
     positions: Positions = None,
 ) -> DescriptorMatches:
-    """Match by nearest neighbour and ratio test (Lowe, 2004), by ascending row of the first set.
+    """Match (N, D) with (M, D) descriptors by nearest neighbour and ratio test (Lowe, 2004).
 
-    The (N, D) and (M, D) descriptors are uint8 or float32. Ratios must be below `ratio` (paper's
-    code: 0.99); `mutual` keeps only mutual nearest neighbours. `seed` and `positions` go to the
-    matcher.
+    Descriptors are uint8 or float32. Lowe's ratio must be below `ratio` (paper's code: 0.99).
+    `mutual` keeps only mutual nearest neighbours. `seed` and `positions` are passed to the matcher.
+    The matches are ordered by the row in the first set.
     """
     if len(descriptors0) == 0 or len(descriptors1) < 2:  # there is no second-best neighbour
         none = np.empty(0, np.int32)

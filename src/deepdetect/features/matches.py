@@ -16,7 +16,7 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""A match ends at a keypoint if its position is at most this far away. Chosen by hand."""
+"""A match position belongs to a keypoint at most this far away. Chosen by hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,
@@ -33,7 +33,7 @@ class Evidence:
 
     Attributes:
         tentative_matches: number of tentative matches from which the geometry was first estimated.
-        tentative_inliers: number of those that agree with it, plus further ones along its lines.
+        tentative_inliers: number of those that agree with it, plus further matches along its lines.
         log10_nfa: decimal logarithm of its number of false alarms (a contrario): how many
             geometries with as many inliers are expected among random matches.
         simulated_views: number of views that were simulated to find it, as in ASIFT.
@@ -69,7 +69,7 @@ class TwoViewGeometry:
             planar scene give two possible poses, those of a rotation no translation.
         confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" if the model
             is.
-        evidence: the figures behind these.
+        evidence: the measurements on which the decision rests.
     """
 
     model: str
@@ -101,10 +101,10 @@ class GuidedMatches:
         scores: (M,) float32 in [0, 1], higher is better.
         subpixel: whether the positions are sub-pixel, from a rectified pair.
         indices1: (M,) int64 keypoints of the second image; None if the positions are not keypoints.
-        points0: (M, 2) float64 positions in the first image if they are not those of keypoints. A
-            match without a keypoint near it then has the index -1.
-        alike: (M,) bool, False if the images contradict a match: the window around it, placed by
-            the matches around, is no more similar than unrelated windows.
+        points0: (M, 2) float64 positions in the first image; None if they are keypoints. A match
+            without a keypoint near it then has the index -1.
+        alike: (M,) bool, False if the images contradict a match: the windows of both images, placed
+            by the surrounding matches, are no more similar than unrelated windows.
     """
 
     indices0: np.ndarray
@@ -123,7 +123,7 @@ class GuidedMatches:
         return xy0[self.indices0] if self.points0 is None else self.points0
 
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
-        """Return these matches and the (M,) bool `chosen` ones of others, of keypoints."""
+        """Return these matches joined with those of `others` that are `chosen`, (M,) bool."""
         order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")
 
         def both(name: str) -> np.ndarray:
@@ -135,7 +135,7 @@ class GuidedMatches:
 
 
 class _Lazy:
-    """A field of keypoints, or of a function that finds them on first access."""
+    """A field that holds keypoints, or a function that finds them on first access."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -424,7 +424,7 @@ class Matches:
 
 
 def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Number the ends of matches: keypoints from 0 up, pixels without one from -1 down."""
+    """Number the end points of matches: keypoints from 0 up, pixels without one from -1 down."""
     ends = indices.astype(np.int64)
     without = np.flatnonzero(indices < 0)
     if len(without):

@@ -21,18 +21,18 @@ from .selection import spread_over_grid
 
 SHOWN_KEYPOINTS = 1000
 AREA_OF_KEYPOINT_PX = 200
-"""The first limits the drawn keypoints. Small images get one per this many pixels, so that all can
-be told apart. Chosen by hand."""
+"""The first is the maximum number of keypoints that are drawn. Small images get one keypoint per
+this area in pixels (the second), so that all can be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
-"""Darker colours of the scale would be invisible on a photograph. Chosen by hand."""
+"""Keypoints use the colour scale from here: darker colours are hard to see. Chosen by hand."""
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     """Draw the best keypoints of all parts of an image, coloured by score or logit, with a scale.
 
-    They are chosen in turns as the best of each cell of a grid, `SHOWN_KEYPOINTS` or fewer. Circles
-    have the keypoints' sizes, or one size if these are unknown. `fit_picture` reduces the image.
+    At most `SHOWN_KEYPOINTS` are drawn: the best of each cell of a grid, then the second-best, and
+    so on. Circles show the sizes of keypoints if known. `fit_picture` reduces the image.
     """
     shown = fit_picture(rgb)
     factor = shown.shape[1] / rgb.shape[1]

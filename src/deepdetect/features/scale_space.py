@@ -12,23 +12,23 @@ LAYERS = 3
 """Layers per octave that hold keypoints, as in Lowe (2004): sigma grows by the cube root of 2."""
 
 BASE_SIGMA_PX = 1.6
-"""Blur of the first image of an octave, in pixels of the octave, as in Lowe (2004)."""
+"""Sigma of the blur of the first image of an octave, in the octave's pixels, as in Lowe (2004)."""
 
 CAMERA_SIGMA_PX = 0.5
-"""Blur that an image is assumed to have already, as in Lowe (2004)."""
+"""Sigma of the blur that an image is assumed to have already, in pixels, as in Lowe (2004)."""
 
 SIZE_PER_SIGMA = 2.0
 """The size of a SIFT keypoint in OpenCV is this many times the sigma of its scale."""
 
 MIN_SIDE_PX = 8
-"""Octaves with a shorter side are not used. Chosen by hand."""
+"""Octaves with a side shorter than this are not used. Chosen by hand."""
 
 
 def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the octave and the layer, from 1 to 3, whose sigma is nearest to that of keypoints.
 
-    The (N,) sizes are twice sigma, as in OpenCV's SIFT; the image has this (height, width). Octave
-    -1 is that of the image at twice its size.
+    The (N,) sizes are twice sigma, as in OpenCV's SIFT. `shape` is the (height, width) of the
+    image. Octave -1 is the image enlarged to twice its size.
     """
     sigma = np.maximum(np.asarray(sizes, np.float64) / SIZE_PER_SIGMA, 1e-6)
     step = np.rint(LAYERS * np.log2(sigma / BASE_SIGMA_PX)).astype(np.int64)
@@ -39,7 +39,7 @@ def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarra
 
 
 def packed_octaves(sizes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return where SIFT describes keypoints of (N,) sizes: octave and layer as packed by OpenCV."""
+    """Return where SIFT describes keypoints of (N,) sizes: octave and layer, packed by OpenCV."""
     octaves, layers = nearest_layers(sizes, shape)
     return (octaves & 255) | (layers << 8)
 
@@ -104,7 +104,7 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
 def set_angles(
     gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray, angles: np.ndarray | None
 ) -> np.ndarray:
-    """Return (N,) float32 angles; unset ones (below 0, or None) become the dominant angles."""
+    """Return (N,) float32 angles, where unset ones (below 0, or None) are the dominant angles."""
     angles = np.full(len(xy), -1, np.float32) if angles is None else angles.copy()
     unset = np.flatnonzero(angles < 0)
     angles[unset] = dominant_angles(gray, xy[unset], sizes[unset])

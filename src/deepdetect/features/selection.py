@@ -1,4 +1,4 @@
-"""Selection of keypoints: from heat maps by probability, or of any points by their positions."""
+"""Selection of keypoints from heat maps, and of well-spread subsets of any keypoints."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from .._shared.options import numbers_of, suggest_keywords
 from .keypoints import Keypoints, bayer_order
 
 MAX_OFFSET_PX = 0.499
-"""Limit of the sub-pixel offset: the nearest pixel of a keypoint stays the same."""
+"""Limit of the sub-pixel offset: below 0.5 the nearest pixel of a keypoint stays the same."""
 
 Rows = Callable[[slice], np.ndarray]
-"""Returns the requested rows of a map."""
+"""A function that returns the requested rows of a map."""
 
 BAND_PIXELS = 4_000_000
 """Maps are processed in bands of about this many pixels, to bound memory."""
 
 GRID_CELLS = 24
-"""Number of cells along the longer side. Each cell gives its strongest keypoints in turn, so that
-keypoints cover the image. Chosen by hand."""
+"""Number of grid cells along the longer side of the image. The cells give their strongest keypoints
+in turn, so that keypoints cover the image. Chosen by hand."""
 
 DISTANCE_STEP_PX = 0.25
 """Precision to which `spread_by_distance` finds the distance. Chosen by hand."""
@@ -33,9 +33,8 @@ DISTANCE_STEP_PX = 0.25
 class Maps:
     """A heat map and the logits that rank its pixels, each computed on demand.
 
-    For a large image either takes more memory than its keypoints, so only one is held at a time.
-    Both are (H, W) float32; `heatmap` computes the map and returns its rows, `logits` computes the
-    logits.
+    Each map of a large image takes more memory than its keypoints, so only one is held at a time.
+    Both are (H, W) float32. `heatmap` computes the map and returns its rows; `logits` the logits.
     """
 
     shape: tuple[int, ...]
@@ -57,7 +56,7 @@ class Maps:
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
-    """Return the probabilities of logits. The exponent is never positive, so nothing overflows."""
+    """Return the probabilities of logits, without overflow for any logit."""
     decay = np.exp(-np.abs(logits))
     return np.where(logits >= 0, np.float32(1), decay) / (1 + decay)
 
@@ -216,7 +215,7 @@ def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -
 
 
 def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions) -> np.ndarray:
-    """Return the pixels that become keypoints, packed like `passing`."""
+    """Return the pixels that become keypoints, as a bit mask packed like `passing`."""
     height, width = ranking.shape
     radius = int(options.nms_radius)
     count = _wanted_count(options, ranking.size)
@@ -263,7 +262,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
 
 
 def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) -> np.floating:
-    """Return the lowest rank among the `count` best of all parts; -infinity if there are fewer."""
+    """Return the `count`-th highest value of all parts; -infinity if there are fewer values."""
     if count == 0:  # the density is less than half a pixel
         return kind.type(np.inf)
     best = np.empty(0, kind)
@@ -282,10 +281,10 @@ def _is_highest(
     first_row: int,
     height: int,
 ) -> np.ndarray:
-    """Return which pixels of a band of this shape rank highest in the window around them.
+    """Return the pixels of a band that rank highest in the window around them.
 
-    The band starts at `first_row` of an image of this height. Among equal scores the first in
-    `bayer_order` ranks higher, so one pixel of a plateau is kept.
+    The band starts at `first_row` of an image of this height. Among equal scores the first pixel in
+    `bayer_order` ranks highest, so that one pixel of a plateau is kept.
     """
     kind = np.float32 if scores.dtype == np.float32 else np.float64
     image = np.full(shape, -np.inf, kind)
@@ -313,7 +312,7 @@ def _is_highest(
 
 
 def peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
-    """Return the offset of a parabola's maximum through each pixel and its two neighbours.
+    """Fit a parabola through each pixel and its two neighbours; return the offset of its maximum.
 
     The axis is 0 (down) or 1 (right). The offset is 0 on the border, and where there is no maximum.
     """
@@ -403,10 +402,10 @@ def suppress_neighbors(
     radius_px: float | np.ndarray,
     max_count: int | None = None,
 ) -> np.ndarray:
-    """Keep points from the best on that are not near a kept one; return their rows, best first.
+    """Keep each point, from the best on, unless it is near a kept one; return the kept rows.
 
-    Near means strictly closer than the radius, or, for (N,) radii, than the smaller of both
-    points'. Among equal scores the first row comes first. `max_count` limits the number of rows.
+    Two points are near if their distance is below the radius or, with (N,) radii, below the smaller
+    one of theirs. Among equal scores the first row comes first. `max_count` limits their number.
     """
     from .kernels import keep_distant
 

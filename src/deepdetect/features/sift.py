@@ -25,14 +25,14 @@ DENSE_SIZES_PX = (2.0, 8.0)
 """Range of keypoint diameters that `dense_sift` supports."""
 
 MIN_DENSE_DENSITY = 0.02
-"""Keypoints per pixel above which `dense_sift` is faster than one keypoint at a time."""
+"""`dense_sift` is faster than one keypoint at a time above this number of keypoints per pixel."""
 
 BIN_WIDTH = 1.5
-"""Width of a spatial bin in units of the keypoint's size (3 times its radius), as in OpenCV."""
+"""Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
 
 CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
-"""SIFT's contrast thresholds (Lowe: 0.04), tried in this order until there are enough keypoints. A
-keypoint's contrast is multiplied by the number of layers first, as in OpenCV."""
+"""SIFT's contrast thresholds, tried in this order until there are enough keypoints. Lowe's value is
+0.04. The thresholds apply to the contrast times the number of layers, as in OpenCV."""
 
 MIN_KEYPOINTS = 1000
 """The next lower contrast threshold is tried if there are fewer keypoints. Chosen by hand."""
@@ -46,10 +46,10 @@ def sift_descriptors(
 ) -> np.ndarray:
     """Compute (N, 128) uint8 SIFT descriptors, by the fastest implementation for these keypoints.
 
-    Many upright keypoints on whole pixels are described all at once, which differs from OpenCV's
-    result by 1 in one of ten thousand numbers; OpenCV describes all others. The size is a diameter
-    in pixels, the angle is in degrees. -1 is OpenCV's "unset", which its SIFT takes for a rotation
-    by one degree, as in the published code.
+    Many upright keypoints on whole pixels are described by `dense_sift`, whose result differs from
+    OpenCV's by 1 in one of ten thousand numbers. Other keypoints are described by OpenCV. The size
+    is a diameter in pixels, the angle is in degrees. OpenCV's SIFT takes the angle -1, which means
+    unset, for a rotation by one degree. The paper's published code does the same.
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and DENSE_SIZES_PX[0] <= size <= DENSE_SIZES_PX[1]
@@ -65,12 +65,12 @@ def dense_sift(
     step_px: int = 1,
     gradient: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Compute upright SIFT descriptors all at once, (N, 128) uint8; they equal OpenCV's.
+    """Compute OpenCV's SIFT descriptors, (N, 128) uint8, of upright keypoints all at once.
 
     OpenCV sums the gradients around each keypoint separately. If all keypoints are upright and of
-    one size, the sums are a filter, bilinear times Gaussian, along rows and then along columns.
-    Positions are whole pixels inside the image. If they are on every `step_px`-th row and column,
-    that saves time. Sizes lie within `DENSE_SIZES_PX`; the gradient is that of `sift_gradient`.
+    one size, these sums are a separable filter (bilinear times Gaussian) of the image. Positions
+    are whole pixels inside the image. Positions that lie on every `step_px`-th row and column take
+    less time. The size lies within `DENSE_SIZES_PX`. The gradient comes from `sift_gradient`.
     """
     from .kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
@@ -108,7 +108,7 @@ def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of the pixels around a keypoint, and where they are not 0.
 
-    They are (4, T) float32 for the four spatial bins, and (4, 3) int64 spans for `describe_tiles`.
+    The weights are (4, T) float32, a row per bin. The (4, 3) int64 spans suit `describe_tiles`.
     """
     from .kernels import TAPS_AT_ONCE
 
@@ -153,14 +153,14 @@ def scaled_sift_descriptors(
     octaves = packed_octaves(sizes, gray.shape)
     size, scores = (gray.shape[1], gray.shape[0]), np.zeros(len(xy))
     keypoints = Keypoints(xy, scores, size, sizes=sizes, angles=angles, octaves=octaves)
-    # Without precise upscaling, octave -1 is a quarter of a pixel off.
+    # Without precise upscaling, octave -1 is shifted by a quarter of a pixel.
     sift = cv2.SIFT_create(nOctaveLayers=LAYERS, enable_precise_upscale=True)
     return _compute(sift, gray, keypoints.to_opencv())
 
 
 def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) -> np.ndarray:
     described, descriptors = sift.compute(gray, keypoints)
-    if len(described) != len(keypoints):  # would silently break the order of rows
+    if len(described) != len(keypoints):  # OpenCV would silently change the order of rows
         raise AssertionError("cv2.SIFT left out keypoints that were given to it")
     return descriptors.astype(np.uint8)  # they are whole numbers from 0 to 255
 
@@ -252,8 +252,8 @@ def correlation_distance(
 ) -> np.ndarray:
     """Return 1 - correlation of pairs of descriptors about a (D,) float32 mean, (K,) float32.
 
-    The pairs are (K,) rows of (N, D) and (M, D) uint8 descriptors. The result is 0 if both are
-    equal, 1 if one of them is the mean.
+    The pairs are (K,) rows of (N, D) and (M, D) uint8 descriptors. The result is 0 for equal
+    descriptors, and 1 if one of them equals the mean.
     """
     from .kernels import correlation_distances
 

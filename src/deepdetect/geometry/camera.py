@@ -31,7 +31,7 @@ from .transforms import outer_corners
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
-"""The disparity offset may differ by this from the difference of both cx. Chosen by hand."""
+"""A stated disparity offset may differ by this from cx right - cx left. Chosen by hand."""
 
 
 @suggest_keywords
@@ -86,20 +86,20 @@ class Camera:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def scaled(self, size: Size) -> Camera:
-        """Return the camera of its image scaled to another (width, height)."""
+        """Return the camera for the same image scaled to another (width, height)."""
         ratio = np.divide(_numbers("the image size", size, 2), self.size)
         centre = (np.array(self.centre) + 0.5) * ratio - 0.5
         return Camera(size, (ratio * self.focal_px).tolist(), centre.tolist())
 
     def rays(self, points: np.ndarray) -> np.ndarray:
-        """Return (N, 3) float64 viewing directions (x, y, 1) of (N, 2) pixels, in its frame."""
+        """Return the (N, 3) float64 rays (x, y, 1) of (N, 2) pixels in the camera's frame."""
         points = numbers_of("points", points, np.float64, 2)
         directions = np.ones((len(points), 3))
         directions[:, :2] = (points - self.centre) / self.focal_px
         return directions
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project (N, 3) points of its frame (x right, y down, z forward) to (N, 2) pixels."""
+        """Project (N, 3) points in the camera's frame (y down, z forward) to (N, 2) pixels."""
         points = numbers_of("points", points, np.float64, 3)
         with np.errstate(divide="ignore", invalid="ignore"):
             return points[:, :2] / points[:, 2:] * self.focal_px + self.centre
@@ -108,11 +108,11 @@ class Camera:
 @suggest_keywords
 @dataclass(frozen=True)
 class Calibration:
-    """Both cameras and, if it is known, their distance.
+    """The two cameras of a stereo pair and, if it is known, the distance between them.
 
     Attributes:
         camera0, camera1: cameras of the left (first) and the right (second) image.
-        baseline_mm: distance of their centres; None if unknown: then depths are in baselines.
+        baseline_mm: distance between their centres. Without it (None) depths are in baselines.
         source: where the calibration comes from, such as "calib.json", "focal_px" or "EXIF".
 
     Raises:
@@ -192,7 +192,7 @@ class Calibration:
             return _calibration(read_camera_file(Path(path), views), size0, size1, str(path))
 
     def check_sizes(self, size0: Size, size1: Size) -> None:
-        """Raise a `ReconstructionError` unless it is for images of these (width, height)."""
+        """Raise a `ReconstructionError` unless the calibration is for images of these sizes."""
         for name, camera, size in (("left", self.camera0, size0), ("right", self.camera1, size1)):
             if camera.size != (other := _numbers("the image size", size, 2)):
                 wanted, actual = (f"{side[0]:g}x{side[1]:g}" for side in (camera.size, other))
@@ -270,7 +270,7 @@ def _camera(view: dict[str, Any], size: Size) -> Camera:
 
 
 def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
-    """Return `count` finite numbers: those of a value, or one number repeated."""
+    """Return a value as `count` finite numbers; a single number is repeated."""
     try:
         numbers = np.broadcast_to(value, count).astype(np.float64, casting="same_kind")
     except (TypeError, ValueError):
@@ -324,19 +324,19 @@ class PosedView:
         return np.asarray(-self.rotation.T @ self.translation)
 
     def relative_to(self, first: PosedView) -> PosedView:
-        """Return it in the frame of another view: its pose maps from that camera to its own."""
+        """Return this view with the other view's camera frame as the world frame."""
         rotation = self.rotation @ first.rotation.T
         return replace(
             self, rotation=rotation, translation=self.translation - rotation @ first.translation
         )
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (N, 2) positions in pixels and (N,) depths of points (N, 3) of the world."""
+        """Project (N, 3) points of the world; return (N, 2) positions in pixels and (N,) depths."""
         seen = np.asarray(points, np.float64) @ self.rotation.T + self.translation
         return self.camera.project(seen), seen[:, 2]
 
     def corners(self, depth: float) -> np.ndarray:
-        """Return the (4, 3) corners of its field of view at a depth."""
+        """Return the (4, 3) corners, in the world, of the field of view at a depth."""
         rays = self.camera.rays(outer_corners(self.camera.size)) * depth
         return np.asarray((rays - self.translation) @ self.rotation)
 
@@ -345,6 +345,6 @@ def camera_spacing(centres: np.ndarray) -> float:
     """Return the median distance from each of (V, 3) camera centres to the nearest other one."""
     blocks = np.array_split(centres, len(centres) // 500 + 1)  # bounds the memory
     distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
-    second = min(1, len(centres) - 1)  # the nearest is the camera itself
+    second = min(1, len(centres) - 1)  # the nearest centre is the camera's own
     nearest = [np.partition(each, second, axis=1)[:, second] for each in distances]
     return float(np.median(np.concatenate(nearest)))

@@ -23,8 +23,8 @@ STEREO = (
     *(("P1", "P2", ""), ("M1", "M2", "D"), ("K1", "K2", "D")),
     ("cameraMatrix1", "cameraMatrix2", "distCoeffs"),
 )
-"""Keys of both camera matrices in OpenCV's files, and the beginning of the keys of their distortion
-coefficients. The projections of rectified views come first."""
+"""Keys in OpenCV's files: the two camera matrices, and the prefix of the keys of their distortion
+coefficients. Projection matrices of rectified views, which have no distortion, come first."""
 
 MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "M1", "K1", "cameraMatrix1")
 PROJECTIONS = ("projection_matrix", "P", "p")
@@ -46,7 +46,7 @@ MIN_BASELINE_MM = 10.0
 Chosen by hand."""
 
 COLMAP_CENTRE = 0.5
-"""The centre of the first pixel in COLMAP; ours is 0."""
+"""Coordinate of the first pixel's centre in COLMAP. In this package it is 0."""
 
 NUMBERS = r"([-+.\deE \t;,\[\]]+)\r?$"
 COLMAP_LINE = re.compile(rf"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]{NUMBERS}", re.MULTILINE)
@@ -125,7 +125,7 @@ def _xml_values(node: ElementTree.Element) -> Any:
 
 
 def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | None:
-    """Return the first matrix with three rows and one of these numbers of elements, or None."""
+    """Return the first matrix that has three rows and an allowed number of elements, or None."""
     for key in keys:
         value = values.get(key)
         data = value.get("data") if isinstance(value, Mapping) else value
@@ -135,7 +135,7 @@ def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | No
 
 
 NO_PINHOLES = "fisheye", "equidistant", "equirectangular"
-"""Parts of the names of camera models that are no pinholes, even without distortion."""
+"""Parts of the names of camera models that are not pinhole models, even without distortion."""
 
 
 def _check_distortion(value: Any, model: Any) -> None:
@@ -173,7 +173,7 @@ def _metres(left: np.ndarray, right: np.ndarray) -> float | None:
 
 
 def _distance(first: Values, second: Values) -> float | None:
-    """Return the distance between two cameras in mm, by poses (EuRoC) or projections (ROS)."""
+    """Return the baseline in mm from two poses (EuRoC) or projection matrices (ROS)."""
     if "T_BS" in first and "T_BS" in second:
         left, right = (np.reshape(each["T_BS"]["data"], (4, 4))[:3, 3] for each in (first, second))
         return float(np.linalg.norm(left - right)) * MM_PER_M
@@ -202,7 +202,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
     made = []
     for model, (width, height, *numbers) in cameras:
         _check_distortion(0, model)
-        if model.startswith(("SIMPLE_", "RADIAL")):  # these have one focal length
+        if model.startswith(("SIMPLE_", "RADIAL")):  # these models have one focal length
             numbers.insert(0, numbers[0])
         fx, fy, cx, cy, *distortion = numbers
         _check_distortion(distortion, model)
@@ -254,7 +254,7 @@ def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _opencv(values: Values, _: Any) -> dict[str, Any] | None:
-    """Read files of OpenCV and ROS; cameras with distortion must have rectified ones, as well."""
+    """Read files of OpenCV and ROS; with distortion they must also hold the rectified cameras."""
     for first, second, distortion in STEREO:
         left, right = (_matrix(values, [key], 9, 12) for key in (first, second))
         if left is not None and right is not None:

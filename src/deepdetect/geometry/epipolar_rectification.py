@@ -23,19 +23,19 @@ from .transforms import transform_points, translation_matrix
 Both = tuple[np.ndarray, np.ndarray]
 
 MAX_STRETCH = 2.0
-"""A planar frame may scale parts of a view by this factor along its line at infinity, and by its
-square across, relative to the middle. Beyond that the epipole is too near, and the frame is polar.
-Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, like the next three values."""
+"""Maximum scale of any part of a view in a planar frame, relative to its middle, along the line
+that is mapped to infinity; across this line the square is allowed. Beyond it the frame is polar.
+This value and the next three were chosen on Oxford, Middlebury, Strecha's fountain and KITTI."""
 
 MAX_AREA = 3.0
 """Maximum area of a planar frame, relative to the larger view."""
 
 RESOLVED_QUANTILE = 0.6
-"""A polar frame has the resolution of the first view at this quantile of the pixels' distances from
-the epipole: it is finer nearer to the epipole, and coarser farther away."""
+"""A polar frame has the resolution of the first view at one distance from the epipole: this
+quantile of all pixels' distances. Nearer pixels are enlarged, farther ones reduced."""
 
 MIN_RADIUS_PX = 8.0
-"""Pixels nearer to the epipole are not rectified: nothing moves there."""
+"""Pixels nearer to the epipole than this are not rectified, because nothing moves there."""
 
 MAX_SIDE_PX = 2**15 - 2
 """Maximum side of a frame: OpenCV cannot warp to a larger one."""
@@ -43,7 +43,7 @@ MAX_SIDE_PX = 2**15 - 2
 
 @dataclass(frozen=True, eq=False)
 class PlanarFrame:
-    """Two views rectified by homographies (3, 3), from their pixels to those of the frame.
+    """Two views rectified by homographies, (3, 3) each, that map their pixels to the frame.
 
     `size` is (width, height); `view` is 0 for the first view and 1 for the second. Content beyond
     the horizon of a homography is not shown.
@@ -75,11 +75,11 @@ class PlanarFrame:
 class PolarFrame:
     """Two views rectified about their epipoles; for the methods see `PlanarFrame`.
 
-    The orientation is 1 or -1: which half of an epipolar line in the second view corresponds to the
-    half in the first. `middle` is the angle of the middle row in the first view, `first_angle` that
-    of the first row relative to it, and `min_radius_px` the radius of the first column. `step` is
-    in radians between rows, and in natural logarithms of the radius between columns. With a
-    homography `plane`, the second view is first warped to the first.
+    The orientation, 1 or -1, says which half of an epipolar line in the second view corresponds to
+    a half in the first. `middle` is the angle of the middle row in the first view, `first_angle`
+    the angle of the first row minus `middle`, and `min_radius_px` the radius of the first column.
+    From row to row the angle grows by `step` radians, from column to column the natural logarithm
+    of the radius by `step`. A homography `plane` first warps the second view to the first.
     """
 
     fundamental: np.ndarray
@@ -93,7 +93,7 @@ class PolarFrame:
     plane: np.ndarray | None = None
 
     def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
-        """Map positions of a view to the frame; not finite for those at the epipole."""
+        """Map positions of a view to the frame; a position at the epipole becomes infinite."""
         if view and self.plane is not None:
             points = transform_points(points, np.linalg.inv(self.plane))
         offset = np.asarray(points, np.float64).reshape(-1, 2) - self.epipoles[view]
@@ -124,7 +124,7 @@ class PolarFrame:
         return cv2.remap(image, places, None, cv2.INTER_LANCZOS4, borderMode=border), shown
 
     def _positions(self, column: np.ndarray, row: np.ndarray, view: int) -> np.ndarray:
-        """Return the positions of columns and rows, broadcast together, in a view, (..., 2)."""
+        """Map columns and rows of the frame, broadcast together, to a view, (..., 2)."""
         angles = self.middle + self.first_angle + row * self.step
         directions = self._directions(angles.ravel(), view).reshape(*row.shape, 2)
         radius = self.min_radius_px * np.exp(column * self.step)
@@ -156,9 +156,9 @@ def rectified_frame(
 ) -> RectifiedFrame | None:
     """Choose a frame in which (N, 2) matches that fit a fundamental matrix lie on rows.
 
-    The frame is planar if that distorts the views, of these (width, height), little, else polar;
-    None if neither is possible. The homography of a plane in the scene removes its slant: the
-    second view is rectified after it is warped to the first.
+    The frame is planar if this distorts the views little, otherwise polar. None if neither is
+    possible. Sizes are (width, height). If the homography of a plane in the scene is given, the
+    second view is first warped to the first by it, so that the slant of the plane disappears.
     """
     if plane is not None:
         shown = transform_points(points1, np.linalg.inv(plane))

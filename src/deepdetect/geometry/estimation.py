@@ -1,8 +1,8 @@
-"""Robust estimation of the geometry between two images, and the chance that it is random.
+"""Robust estimation of the geometry between two images, and its number of false alarms (NFA).
 
-Moisan and Stival, "A probabilistic criterion to detect rigid point matches between two images and
-estimate the fundamental matrix", 2004. The number of false alarms (NFA) of a geometry is the number
-of models with as many inliers at this threshold that are expected among random matches.
+The NFA of a geometry is the expected number of models that have at least as many inliers, at the
+same threshold, if all matches are random (Moisan and Stival, "A probabilistic criterion to detect
+rigid point matches between two images and estimate the fundamental matrix", 2004).
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from .transforms import epipolar_errors, transfer_errors, transform_points
 MODEL_NAMES = ("auto", "homography", "fundamental", "essential")
 
 MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
-"""Fewest matches; below 15 OpenCV's RANSAC ignores the threshold of a fundamental matrix."""
+"""Minimum number of matches. For a fundamental matrix OpenCV ignores the threshold below 15."""
 
 MAX_LOG10_NFA = -6.0
 """A geometry is accepted below this log10 of its number of false alarms. Chosen by hand."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
-"""Number of matches that determine a model."""
+"""Number of matches that a minimal solver needs."""
 
 MIN_PARALLAX_PX = 3.0
-"""Matches with at least this transfer error are off the plane. This value and the next three were
-chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+"""Matches with at least this transfer error, in pixels, are off the plane. This value and the next
+three were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MAX_EPIPOLE_DISTANCE_PX = 1.5
-"""Maximum distance of such a match from the line through the epipole."""
+"""A match off the plane agrees with an epipole if it lies this near to its line through it."""
 
 MIN_FRACTION_OF_PLANE = 0.2
-"""Matches show depth if this many agree on an epipole, relative to those on the plane: repeated
-patterns or moved objects give fewer."""
+"""The scene has depth if the number of matches that agree on an epipole is at least this fraction
+of the number on the plane. Repeated patterns and moved objects give fewer."""
 
 MIN_FRACTION_OF_REST = 0.5
-"""If matches alone decide, this fraction of those off the plane must also agree."""
+"""Without other evidence, this fraction of the matches off the plane must also agree."""
 
 MAX_MATCHES = 2000
 """Maximum number of matches off the plane; more are sampled at random. Chosen by hand."""
@@ -266,7 +266,8 @@ def fit_essential(
 ) -> np.ndarray | None:
     """Fit an essential matrix to (N, 3) directions (x, y, 1); None or malformed if that fails.
 
-    They are passed as pixels of one camera: MAGSAC of OpenCV 5 is less accurate in normalised ones.
+    OpenCV gets them as pixels of one camera, because its MAGSAC (version 5) is less accurate in
+    normalised coordinates.
     """
     matrix, _ = cv2.findEssentialMat(
         np.ascontiguousarray(rays0[:, :2] * focal_px),
@@ -332,7 +333,7 @@ class Parallax:
     Matches of a static scene that a homography does not explain move along lines through the
     epipole (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane",
     2005). Wrong matches move anywhere, and those of a repeated pattern in one direction, but they
-    are few compared with those on the plane. `log10_nfa` is that of the agreement.
+    are few compared with those on the plane. `log10_nfa` tells how likely the agreement is chance.
     """
 
     on_plane: int
@@ -342,11 +343,11 @@ class Parallax:
 
     @property
     def significant(self) -> bool:
-        """Whether more agree than chance explains."""
+        """Whether more matches agree on the epipole than chance explains."""
         return self.log10_nfa < MAX_LOG10_NFA
 
     def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether more agree than chance explains, and than this fraction of those on the plane."""
+        """Whether `significant`, and at least this fraction of the number on the plane agree."""
         return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property
@@ -358,11 +359,11 @@ class Parallax:
 
 @dataclass(frozen=True, eq=False)
 class TwoViewModel(Geometry):
-    """A geometry with its evidence; its model is "none" if none could be estimated.
+    """A geometry with its evidence. The model is "none" if the estimation failed.
 
     Attributes:
         log10_nfa: decimal logarithm of its number of false alarms.
-        parallax: what a homography leaves, if the model was chosen automatically.
+        parallax: of the matches off the homography, if the model was chosen automatically.
     """
 
     log10_nfa: float
@@ -370,7 +371,7 @@ class TwoViewModel(Geometry):
 
     @property
     def trusted(self) -> bool:
-        """Whether chance does not explain it."""
+        """Whether the geometry has more inliers than chance explains."""
         return self.log10_nfa < MAX_LOG10_NFA
 
 
@@ -415,7 +416,7 @@ def measure_parallax(
 
 
 def _misses(epipoles: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the distances of points from the lines through epipoles and predictions, (E, N)."""
+    """Return the distances of N points from the lines through E epipoles and the predictions."""
     x, y, scale = epipoles.T[:, :, None]
     normal = np.hypot(y - scale * first[:, 1], scale * first[:, 0] - x)
     return np.abs(epipoles @ np.cross(first, second).T) / np.maximum(normal, 1e-12)

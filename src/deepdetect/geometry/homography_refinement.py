@@ -1,10 +1,11 @@
-"""Refinement of a homography on the images in a fraction of a second, each step cross-validated.
+"""Refinement of a homography by the image content, each step cross-validated.
 
-Corners are tracked between the first image and the warped second one, forth and back, and a
-homography is fitted to them. Then all pixels of a smaller copy are aligned (Evangelidis and
+First, corners are tracked between the first image and the warped second one, forward and back, and
+a homography is fitted to the tracks. Then all pixels of a smaller copy are aligned (Evangelidis and
 Psarakis, "Parametric image alignment using enhanced correlation coefficient maximization", 2008).
-The squares of a chessboard divide the image into two halves. A step is kept only if, on each half,
-the correction fitted *without* that half correlates the images better than before.
+For validation, a chessboard pattern divides the image into two halves, and a correction is fitted
+to each. A step is kept only if more windows match better than worse when each half is warped by the
+correction fitted to the other. All of this takes a fraction of a second.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from .transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
 """Side of the tracked windows in pixels, number of corners, and levels of the pyramid, for each
-round. In the first one tracks move further, and half as many corners suffice. Chosen by hand."""
+round. The first round has larger motion and needs only half as many corners. Chosen by hand."""
 
 MIN_TRACKS = 15
 """Minimum number of tracks to which a homography is fitted. Chosen by hand."""
@@ -42,7 +43,7 @@ TRACKING_STEP_PX = 0.02
 """A track that moves by less than this has converged. Chosen by hand."""
 
 MAX_ROUND_TRIP_PX = 0.3
-"""A track counts if it ends this near to its start, forth and back. Chosen by hand."""
+"""A track, forward and back, is kept if it ends this near to its start. Chosen by hand."""
 
 CAUCHY_SCALE_PX = 1.0
 """A track with this residual has half the weight of an exact one. Chosen by hand."""
@@ -64,14 +65,14 @@ STEP_PX = WINDOW_PX // 3
 """Distance between the windows in which images are compared. Chosen by hand."""
 
 Fit = Callable[[np.ndarray], "np.ndarray | None"]
-"""Maps the (H, W) bool mask of the pixels that may be used to a correction, (3, 3), or None."""
+"""A function from the (H, W) bool mask of usable pixels to a (3, 3) correction or None."""
 
 
 def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Refine a homography, keeping only what holds on parts of the image that it was not fitted to.
+    """Refine a homography by two grey images; see the module for how each step is validated.
 
-    The images are (H, W) uint8, and the homography is accurate to some ten pixels. The last element
-    of the result is 1; it is the same homography if nothing better was found.
+    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. If no step
+    improves it, it is returned unchanged, apart from its scale: the last element is 1.
     """
     size = (gray0.shape[1], gray0.shape[0])
     blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)
@@ -100,8 +101,8 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         np.copyto(mixed, other, where=half)
         np.copyto(mixed_mask, other_mask, where=half)
         gain = correlation(mixed, mixed_mask) - correlation(warped, valid_mask)
-        # Counts windows that improve minus those that get worse. The mean would also rise for a
-        # compromise between a plane and what lies off it.
+        # The number of windows that get better is compared with the number that get worse. A mean
+        # would also rise for a compromise between a plane and objects off the plane.
         gain = gain[inner & np.isfinite(gain)]
         correction = fit(valid_mask) if np.sign(gain).sum() > 0 else None
         if correction is not None:
@@ -131,8 +132,8 @@ def _fit_to_corners(
 ) -> Fit:
     """Track corners, and return the fit to those in a part of the image.
 
-    It is weighted least squares, which is accurate on most of an image that no single homography
-    fits (lens distortion, a wall that is not quite flat); a consensus would differ each time.
+    Weighted least squares is accurate on most of an image even if no homography fits all of it, as
+    with lens distortion. The result of RANSAC would then differ with each random sample.
     """
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
@@ -188,7 +189,7 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
 def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
     """Fit a homography by iteratively reweighted least squares with Cauchy weights.
 
-    Its last element is 1; None if the points do not determine it.
+    The last element of the result is 1. None if the points do not determine a homography.
     """
     middle = points0.mean(axis=0)
     spread = float(np.abs(points0 - middle).mean())

@@ -1,4 +1,4 @@
-"""Images scaled, warped, correlated and tracked, and sums over their windows."""
+"""Scaling, warping, correlation and tracking of images, and sums over windows."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
 ANTIALIASING_SIGMA = 0.5
-"""Blur before downscaling, as sigma in units of sqrt(1 / scale^2 - 1) px. Chosen by hand."""
+"""Blur before downscaling: sigma = this times sqrt(1 / scale^2 - 1) pixels. Chosen by hand."""
 
 WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25
 """Sigma of the blur before images are compared, against noise and resampling. Chosen by hand."""
 
 NOISE_STD = 2.0
-"""Grey levels added to a window's deviation, so that noise is not amplified. Chosen by hand."""
+"""This many grey levels are added to a window's standard deviation before it divides, so that
+noise is not amplified. Chosen by hand."""
 
 MAX_UNKNOWN_WEIGHT = 1e-3
 """Maximum weight of pixels without data in an interpolated pixel. Chosen by hand."""
@@ -32,8 +33,7 @@ def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
     scale = min(1.0, max_side / max(gray.shape))
     if scale == 1:
         return gray, 1.0
-    # Sides are seldom whole numbers of pixels. Sampling by the scale itself keeps it exact for
-    # both sides.
+    # Sides are rounded to whole pixels. Sampling by the scale itself keeps it exact for both.
     size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
     smooth = antialiased(gray, scale)
     affine = scaling_matrix(scale)[:2]
@@ -69,7 +69,7 @@ def warp_bands(
 ) -> np.ndarray:
     """Warp (H, W, C) of any type as `warp_to_reference` does; pixels without data are `no_data`.
 
-    So are pixels that depend on these. None means that all pixels have data, and fills with 0.
+    Result pixels that depend on a `no_data` pixel also become `no_data`. None fills with 0.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:
@@ -96,9 +96,9 @@ def local_zncc(
     window_px: int = WINDOW_PX,
     step_px: int = 1,
 ) -> np.ndarray:
-    """Compute the zero-mean normalised cross-correlation of the windows around each pixel.
+    """Compute the zero-mean normalised cross-correlation (ZNCC) of windows at the same positions.
 
-    The side of the windows is an odd multiple of `step_px`, on squares of which they are centred.
+    One window is centred on each square of `step_px` pixels; its side is an odd multiple of that.
     Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for flat or partly masked windows.
     """
     side = window_px // step_px
@@ -131,7 +131,7 @@ def local_zncc(
 
 
 def warped_zncc(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Return the `local_zncc` of an image and another one that a homography warps to it."""
+    """Return the `local_zncc` of the first image and the second one warped to it."""
     warped, valid = warp_to_reference(gray1, homography, gray0.shape[::-1])
     first, second = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (gray0, warped))
     return local_zncc(first, second, erode_mask(valid, BLUR_SIGMA_PX))
@@ -157,7 +157,7 @@ def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
 def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
     """Subtract the mean of the window around each pixel and divide by its standard deviation.
 
-    The correlation of two such images, (H, W) float32, is that of all their windows at once.
+    Returns (H, W) float32. The mean product of two such images over a window is about its ZNCC.
     """
     window = (WINDOW_PX, WINDOW_PX)
     values = gray.astype(np.float32)
@@ -182,9 +182,9 @@ def window_sums(
 ) -> np.ndarray:
     """Sum the values of the pixels in the square window around each pixel, (M,).
 
-    The (N, 2) int64 `pixels` (x, y) are all different; `values` has one for each, or one for all.
-    `shape` is that of the image, (H, W, ...). The windows are centred at the (M, 2) pixels `at`, or
-    at the pixels themselves. The sums have the `dtype` of the values unless another is given.
+    The (N, 2) int64 `pixels` (x, y) are all different. `values` has one value for each of them, or
+    one for all. `shape` is the shape of the image, (H, W, ...). The windows are centred at the
+    (M, 2) pixels `at`, by default at `pixels`. The sums have the type of the values, or `dtype`.
     """
     image = _scatter(pixels, values, shape, dtype)
     window = (window_px, window_px)
@@ -230,10 +230,10 @@ def track_round_trip(
     """Track (N, 2) points from one (H, W) uint8 image to the other and back (Lucas-Kanade).
 
     Each of the `levels` of the pyramid above the image doubles how far a track can move. A track
-    that moves by less than `step_px` has converged. The search begins at the `expected` (N, 2)
-    positions, or at the same position; the way back begins at the start itself if `back_to_start`.
-    Returns (N, 2) float32 positions in the second image, and (N,) distances from the start after
-    the way back, infinite for lost tracks.
+    that moves by less than `step_px` in an iteration has converged. The search begins at the
+    `expected` (N, 2) positions, by default at the points, and on the way back at the points if
+    `back_to_start`. Returns (N, 2) float32 positions in the second image, and the (N,) distances
+    between both ends of the round trip in pixels, infinite for lost tracks.
     """
     settings = {
         "winSize": (window_px, window_px),
@@ -286,7 +286,8 @@ def zncc_at_points(
 
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99
-"""Sigma of the blur before the gradient, and quantile of its length for white. Chosen by hand."""
+"""The first is the sigma of the blur before the gradient is computed. Gradients are scaled so that
+the second, a quantile of their lengths, becomes white. Both were chosen by hand."""
 
 
 def edge_strength(gray: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ UNITS = {
     "baseline": "baselines (1 = the distance of the two cameras)",
     "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
 }
-"""Units of length, as files explain them; with the last two the scale is unknown."""
+"""Units of length, with the names that files give them. The last two have no metric scale."""
 
 EAST_NORTH_UP = "x east, y north, z up"
 """Frame of a georeferenced cloud; other frames are those of cameras."""
@@ -24,7 +24,7 @@ BOX_PERCENTILE = 1.0
 """Percentage of the points beyond each side of the robust box. Chosen by hand."""
 
 MAX_ANGULAR_SPACING = 0.02
-"""Maximum width at which a point is drawn, in radians (1 degree). Chosen by hand."""
+"""Maximum width of a drawn point as seen by the camera, in radians. Chosen by hand."""
 
 
 @suggest_keywords
@@ -106,7 +106,7 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class RobustBox:
-    """The axis-aligned box of all points except the outermost, by two (3,) corners."""
+    """An axis-aligned box around all points except the outermost, given by two (3,) corners."""
 
     low: np.ndarray
     high: np.ndarray
@@ -137,8 +137,8 @@ def robust_box(cloud: PointCloud) -> RobustBox:
 def angular_spacing(cloud: PointCloud) -> float:
     """Return the angle between neighbouring points as seen by the left camera, in radians.
 
-    It is the width of a point divided by its depth, as if all points were spread evenly. Points of
-    a dense cloud that are drawn in this size look closed. An empty cloud is an OptionError.
+    It is estimated as if the points were spread evenly. A dense cloud looks like a closed surface
+    if its points are drawn in this width. An empty cloud is an OptionError.
     """
     require_points(cloud)
     ahead = cloud.points[cloud.points[:, 2] > 0]

@@ -15,7 +15,7 @@ Pose = tuple[np.ndarray, np.ndarray]
 """A pose is a rotation (3, 3) and a translation (3,): X1 = rotation @ X0 + translation."""
 
 BLOCK = 100_000
-"""Number of matches triangulated at once: some twenty arrays of this length are held in memory."""
+"""Number of matches triangulated at once, to bound the memory of some twenty arrays."""
 
 MAX_ITERATIONS = 10
 """Gauss-Newton stops after this many steps. Chosen by hand."""
@@ -33,15 +33,15 @@ MIN_INLIER_GAIN = 0.01
 """A fit is repeated while the number of inliers grows by this fraction. Chosen by hand."""
 
 MAX_MATCHES = 50_000
-"""The pose is fitted to this many evenly sampled matches: more do not improve it."""
+"""The pose is fitted to at most this many evenly sampled matches: more do not improve it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
     """Points (N, 3) float64 in the frame of the first camera, not finite where rays are parallel.
 
-    `cheirality` (N,) says which lie in front of both cameras; the errors (N,) are in pixels, the
-    root mean square of both images, and the angles (N,) between both rays in radians.
+    `cheirality` (N,) bool tells the points in front of both cameras. The (N,) reprojection errors
+    in pixels are the root mean square of both images. The (N,) angles of the rays are in radians.
     """
 
     points: np.ndarray
@@ -57,11 +57,11 @@ def triangulate(
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> Triangulation:
-    """Triangulate (N, 2) matches in pixels: a point X is rotation @ X + translation in the second.
+    """Triangulate (N, 2) matches in pixels by the pose X1 = rotation @ X0 + translation.
 
-    Both positions are first moved onto a pair of epipolar lines (`correct_matches`): this is the
-    maximum likelihood for errors of the same size in both images. The rays then meet, and the depth
-    is a quotient, accurate even at small angles.
+    The positions are first moved onto corresponding epipolar lines (`correct_matches`), which is
+    the maximum likelihood estimate for equal noise in both images. The two rays then meet, and the
+    depth follows from one division, which is accurate even at small angles.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -113,7 +113,7 @@ def correct_matches(
         step = step * 2 * root / ((next0**2).sum(1) + (next1**2).sum(1))
         moved0 = points0 - step[:, None] * next0
         moved1 = points1 - step[:, None] * next1
-    # On an epipole every line is right: such a match stays where it is.
+    # Every line through an epipole is an epipolar line, so a match on it stays where it is.
     known = np.isfinite(moved0).all(1) & np.isfinite(moved1).all(1)
     return np.where(known[:, None], moved0, points0), np.where(known[:, None], moved1, points1)
 
@@ -155,9 +155,9 @@ def estimate_relative_pose(
     inlier_threshold: float = 1.0,
     seed: int = 0,
 ) -> RelativePose | None:
-    """Estimate the pose from (M, 2) matches in pixels: essential matrix by MAGSAC, then refined.
+    """Estimate the relative pose from (M, 2) matches in pixels, by MAGSAC and a refinement.
 
-    Returns None when there are too few matches or it cannot be estimated.
+    Returns None if there are too few matches or the estimation fails.
     """
     essential = GeometryOptions(
         inlier_threshold=inlier_threshold,
@@ -198,10 +198,11 @@ def refine_pose(
     translation: np.ndarray,
     scale_px: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a pose to (M, 2) matches, mostly right: Sampson distances with a Cauchy loss.
+    """Refine a pose by the Sampson distances of (M, 2) matches, most of them correct.
 
-    By Gauss-Newton, over three angles of the rotation and two of the translation's direction; never
-    worse than the initial pose. Half of `scale_px` gives a match half the weight of an exact one.
+    Gauss-Newton minimises a Cauchy loss over three angles of the rotation and two of the direction
+    of the translation. The result is never worse than the initial pose. A match with half of
+    `scale_px` as its distance has half the weight of an exact one.
     """
     points0, points1 = _evenly(points0), _evenly(points1)
 
@@ -235,7 +236,7 @@ def refine_pose(
 def moved_pose(pose: Pose, change: np.ndarray) -> Pose:
     """Return a pose near another: a change of 5 angles in radians.
 
-    Three rotate the rotation, two move the translation, of length 1, across itself.
+    The first three change the rotation, the other two the translation, which keeps the length 1.
     """
     rotation, translation = pose
     small = cv2.Rodrigues(np.asarray(change[:3], np.float64))[0]
@@ -247,7 +248,7 @@ def moved_pose(pose: Pose, change: np.ndarray) -> Pose:
 
 
 def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return what `np.cross` does of two vectors, in a tenth of the time."""
+    """Return the cross product of two vectors, in a tenth of the time of `np.cross`."""
     (x0, y0, z0), (x1, y1, z1) = first.tolist(), second.tolist()
     return np.array([y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1])
 
@@ -255,7 +256,7 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def best_of_four(
     essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation and translation with most points in front of both cameras.
+    """Return the pose, of the four of an essential matrix, with most points before both cameras.
 
     The essential matrix is in normalised coordinates, the (M, 2) matches are in pixels.
     """

@@ -1,10 +1,11 @@
-"""The fundamental matrix of two cameras of which something is known: those of most images.
+"""The fundamental matrix of two usual cameras with an unknown focal length.
 
-Pixels are square, the principal point lies near the middle of the image, and both images were taken
-with about the same focal length. Five matches then give a relative pose for each focal length that
-is tried, where a fundamental matrix needs seven: the share of samples without a wrong match is far
-larger, and so few matches leave fewer degrees of freedom to chance. Which focal length is nearest
-is decided by how many matches agree; then pose and cameras are fitted to them together.
+The assumptions hold for most images: pixels are square, the principal point lies near the middle of
+the image, and both images were taken with about the same focal length. A few focal lengths are
+tried. For each of them RANSAC needs only five matches per sample, for a relative pose, instead of
+seven for a fundamental matrix. So more samples are free of wrong matches, and the model has fewer
+degrees of freedom to fit wrong ones. The focal length with most inliers is kept. Then the pose and
+both cameras are fitted to the inliers together.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ MODELS_PER_SAMPLE = 10
 """Five matches give up to ten essential matrices."""
 
 START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
-"""A fit starts from one of these focal lengths, in units of the longer side: the one whose
-essential matrix is nearest. Chosen by hand."""
+"""Initial focal lengths of a fit, in units of the longer side of the image. The fit starts from the
+one that turns the fundamental matrix most nearly into an essential matrix. Chosen by hand."""
 
 MIN_MATCHES = 6
 """An essential matrix needs five matches; one more is needed to judge it."""
 
 FOCAL_LENGTHS = (0.7, 1.4)
-"""Focal lengths that are tried, in units of the longer side of the image. The two are as good as a
-dense range from a wide angle of 90 degrees to a telephoto lens of 28."""
+"""Focal lengths that are tried, in units of the longer side of the image. These two are as good as
+a dense range that covers fields of view from 90 to 28 degrees."""
 
 CONFIDENCE = 0.9999
-"""RANSAC stops when the best model has been found with this probability."""
+"""RANSAC stops when some sample was free of outliers with this probability."""
 
 ITERATIONS = 5000
 """RANSAC draws at most this many samples for each focal length. Chosen by hand."""
@@ -52,7 +53,7 @@ PRINCIPAL_POINT_SPREAD = 0.03
 by hand."""
 
 MATCH_SIGMA_PX = 0.5
-"""Standard deviation of correct matches from their epipolar lines, in pixels. Chosen by hand."""
+"""Standard deviation of correct matches from epipolar lines, in pixels. Chosen by hand."""
 
 MAX_FITS = 4
 """Pose and cameras are fitted to their own inliers at most this many times. Chosen by hand."""
@@ -70,8 +71,8 @@ def estimate_semi_calibrated(
 ) -> TwoViewModel | None:
     """Estimate a fundamental matrix from (M, 2) matches, many of which may be wrong.
 
-    The images have these (width, height); the threshold is a Sampson distance in pixels. None with
-    too few matches, or where nothing could be estimated.
+    The sizes of the images are (width, height), and the threshold is a Sampson distance in pixels.
+    Returns None if there are too few matches or the estimation fails.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -122,11 +123,11 @@ def refine_fundamental(
     sizes: tuple[Size, Size],
     match_sigmas_px: np.ndarray,
 ) -> np.ndarray:
-    """Fit a fundamental matrix to matches that are mostly right, and to what cameras usually are.
+    """Refine a fundamental matrix by matches, most of them correct, and by a prior on the cameras.
 
-    Where the matches say little, as about the focal length or at the borders, the usual decides.
-    They have (M,) standard deviations from their epipolar lines. The matrix has norm 1; with fewer
-    than six matches it is the one that was given.
+    The prior decides where the matches say little, such as on the focal length or at the borders.
+    `match_sigmas_px` are the (M,) standard deviations of the matches from their epipolar lines. The
+    result has norm 1. With fewer than six matches the given matrix is returned.
     """
     if len(points0) < MIN_MATCHES:
         return fundamental
@@ -138,7 +139,7 @@ def refine_fundamental(
 
 
 def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Cameras:
-    """Return the cameras of one focal length under which the matrix is most nearly essential."""
+    """Return the cameras, of `START_FOCAL_LENGTHS`, that make the matrix most nearly essential."""
 
     def likeness(cameras: _Cameras) -> float:
         largest, middle, _ = np.linalg.svd(cameras.essential(fundamental), compute_uv=False)
@@ -151,7 +152,7 @@ def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Came
 class _Cameras:
     """Both cameras: (2,) natural logarithms of focal lengths, (2, 2) offsets of principal points.
 
-    Both in units of the longer side of each image.
+    Focal lengths and offsets are in units of the longer side of each image.
     """
 
     sizes: tuple[Size, Size]
@@ -192,7 +193,7 @@ class _Cameras:
         return _Cameras(self.sizes, self.log_focal + change[:2], offsets)
 
     def deviations(self) -> np.ndarray:
-        """Return by how many standard deviations they are unusual, (6,)."""
+        """Return the (6,) deviations of the parameters from the prior, in standard deviations."""
         mean, difference = self.log_focal.mean(), self.log_focal[0] - self.log_focal[1]
         of_focal = [mean / FOCAL_SPREAD, difference / FOCAL_DIFFERENCE]
         return np.append(of_focal, self.offsets / PRINCIPAL_POINT_SPREAD)
@@ -226,7 +227,7 @@ def _fit_essential(
             CONFIDENCE,
             ITERATIONS,
         )
-    except cv2.error:  # degenerate input, as all points in one place
+    except cv2.error:  # degenerate input, such as coinciding points
         return None
     if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None
@@ -234,7 +235,7 @@ def _fit_essential(
 
 
 def _fit(views: Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> Views:
-    """Fit pose and cameras to matches, with a Cauchy loss, and to what is usual (MAP estimate)."""
+    """Fit pose and cameras to matches with a Cauchy loss and the prior (a MAP estimate)."""
     count = len(points0)
 
     def residuals(views: Views) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Similarities between points in two frames, robust to outliers: the place and scale of a model.
+"""Robust fitting of a similarity between points in two frames, which georeferences a model.
 
-Least median of squares finds the similarity on which most points agree. Gauss-Newton with Huber's
-weights then fits all of them, and directions that are known to be horizontal.
+Least median of squares finds a similarity on which most points agree. Gauss-Newton with Huber's
+weights then refines it by all points, and by directions that are known to be horizontal.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ MAX_SAMPLES = 500
 """Number of pairs, and of triples, of points that the search tries. Chosen by hand."""
 
 MAX_START_TILT_DEG = 60.0
-"""A triple's upward direction may differ from the known one by this: near a line it may be any."""
+"""The similarity of three points may tilt the known upward direction by at most this angle. Three
+points near a line may give any tilt."""
 
 MIN_AREA_POINTS, MIN_AREA = 8, 0.2
-"""The known upward direction can be overruled by this many points with this spread across, relative
-to that along. Chosen by hand."""
+"""The points can overrule the known upward direction only if there are at least as many as the
+first, and their second principal spread exceeds the first one times the second. Chosen by hand."""
 
 MUCH_BETTER = 0.5
-"""The known up is wrong if the median distance falls by this factor without it. Chosen by hand."""
+"""The known upward direction is overruled if the median distance without it is below this fraction
+of the median distance with it. Chosen by hand."""
 
 HUBER_STDS = 2.0
 """Residuals above this many standard deviations get less weight. Chosen by hand."""
 
 WRONG_STDS = 5.0
-"""A point beyond this many standard deviations is wrong, and gets no weight. Chosen by hand."""
+"""A point with a residual above this many standard deviations gets no weight. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
-"""The stated accuracy counts as this many coordinates: few residuals say little. Chosen by hand."""
+"""The stated accuracy counts as this many residuals: few residuals say little. Chosen by hand."""
 
 MAD_STD = 1.4826
 """Standard deviation of a normal distribution, divided by the median of absolute values."""
@@ -174,7 +176,7 @@ def _search(
     scale: float | None,
     seed: int,
 ) -> Similarity | None:
-    """Find the similarity of three points, or of two and up, with the least median distance."""
+    """Find the similarity of three points, or two and `up`, with the least median distance."""
     random = np.random.default_rng(seed)
     best: dict[bool, tuple[float, Similarity | None]] = dict.fromkeys((True, False), (np.inf, None))
     for size in [3] * MAX_SAMPLES + [2] * (0 if up is None else MAX_SAMPLES):
@@ -200,9 +202,9 @@ def least_squares_similarity(
     up: np.ndarray | None = None,
     scale: float | None = None,
 ) -> Similarity | None:
-    """Fit a similarity by least squares (Umeyama, 1991); with `up` it only rotates about it.
+    """Fit a similarity by least squares (Umeyama, 1991). None if all points coincide.
 
-    None if all points coincide.
+    With `up`, this direction is mapped to the z axis, and only the rotation about it is fitted.
     """
     middle, middle_of_targets = points.mean(axis=0), targets.mean(axis=0)
     own, other = points - middle, targets - middle_of_targets
@@ -226,9 +228,9 @@ def least_squares_similarity(
 
 
 def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.ndarray:
-    """Return the (3,) standard deviations of targets: one for x and y, and one for heights."""
+    """Return the (3,) standard deviations of the targets, the same for x and y."""
     stds = []
-    for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: parameters that are fitted to them
+    for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: number of fitted parameters
         values = np.abs(residuals[:, axes][known[:, axes]])
         squares = len(values) * (MAD_STD * np.median(values)) ** 2 if len(values) else 0.0
         free = PRIOR_COUNT + max(len(values) - lost, 0)
@@ -237,6 +239,6 @@ def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.nda
 
 
 def _covariance(normal: np.ndarray) -> np.ndarray:
-    """Return the inverse, with large values for parameters that are not determined."""
+    """Invert a normal matrix, with large variances for parameters that it does not determine."""
     values, vectors = np.linalg.eigh(normal)
     return np.asarray(vectors / np.maximum(values, 1e-12 * values[-1]) @ vectors.T)

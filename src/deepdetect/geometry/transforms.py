@@ -32,7 +32,7 @@ def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
 def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Return the transfer error of each match under a homography, (N,) float64 in pixels.
 
-    It is one-way, from the first image to the second, as in the paper.
+    The error is one-way: the distance in the second image, as in the paper.
     """
     gaps = transform_points(points0, homography)
     gaps -= points1
@@ -57,7 +57,7 @@ def epipolar_errors(
 def signed_epipolar_errors(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> np.ndarray:
-    """Return `epipolar_errors` with a sign: the side of the line on which a match lies."""
+    """Return `epipolar_errors` with a sign that tells the side of the epipolar line."""
     points0, points1 = np.asarray(points0, np.float64), np.asarray(points1, np.float64)
     across1, down1, algebraic = _apply(fundamental, points0)
     across0, down0 = _apply(fundamental.T[:2], points1)
@@ -74,7 +74,7 @@ def signed_epipolar_errors(
 def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """Return the coordinates of the points (x, y, 1) times a matrix of three columns.
 
-    They are computed one by one: a matrix product with three columns takes several times as long.
+    Each coordinate is computed by itself, because a matrix product takes several times as long.
     """
     x, y = points[:, 0], points[:, 1]
     coordinates = []
@@ -112,8 +112,8 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
 def score_errors(errors: np.ndarray) -> dict[str, float]:
     """Score the (N,) errors of `disparity_errors`, NaN where the ground truth is unknown.
 
-    Returns the number of "matches", of those that can be "evaluated", of those that are "correct"
-    within `TOLERANCE_PX`, and the "precision", the correct fraction of the evaluated ones.
+    Returns the number of all "matches", of "evaluated" matches (with known ground truth), and of
+    "correct" matches (within `TOLERANCE_PX`), and the "precision": correct / evaluated.
     """
     evaluated = int(np.isfinite(errors).sum())
     correct = int((errors <= TOLERANCE_PX).sum())
@@ -123,7 +123,7 @@ def score_errors(errors: np.ndarray) -> dict[str, float]:
 
 
 def translation_matrix(x: float, y: float) -> np.ndarray:
-    """Return the (3, 3) map that moves positions by (x, y)."""
+    """Return the (3, 3) homography that moves positions by (x, y)."""
     return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
 
 
@@ -134,22 +134,22 @@ def outer_corners(size: tuple[int, int]) -> np.ndarray:
 
 
 def scaling_matrix(scale: float) -> np.ndarray:
-    """Return the (3, 3) map from an image to the same image at another scale."""
+    """Return the (3, 3) homography from an image to the same image at another scale."""
     shift = 0.5 * scale - 0.5
     return np.array([[scale, 0, shift], [0, scale, shift], [0, 0, 1]])
 
 
 def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
-    """Return positions in an image of another scale; pixel centres are whole numbers."""
+    """Return positions of an image at another scale; pixel centres are whole numbers in both."""
     return (np.asarray(points, np.float64) + 0.5) * scale - 0.5
 
 
 def scaled_homography(homography: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
-    """Return the homography between both images at other scales, with 1 as its last element."""
+    """Return the homography for scaled copies of both images; its last element is 1."""
     matrix = scaling_matrix(scale1) @ homography @ scaling_matrix(1 / scale0)
     return matrix / matrix[2, 2]
 
 
 def scaled_fundamental(fundamental: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
-    """Return the fundamental matrix between both images at other scales."""
+    """Return the fundamental matrix for scaled copies of both images."""
     return scaling_matrix(1 / scale1).T @ fundamental @ scaling_matrix(1 / scale0)

@@ -25,35 +25,35 @@ from .semi_calibrated import START_FOCAL_LENGTHS, estimate_semi_calibrated
 from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
-"""Inlier thresholds of models that only guide: keypoints of small copies are coarse."""
+"""Inlier thresholds in pixels of models that only guide: keypoints of small copies are coarse."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
-"""Inlier thresholds for classifying a scene by refined matches. Chosen on the data named above."""
+"""Inlier thresholds in pixels for classifying a scene. Chosen on the data named above."""
 
 MIN_MATCHES = 30
 """A scene is not classified with fewer matches. Chosen on the data named above."""
 
 MIN_PLANAR_RATIO = 0.75
-"""A scene whose homography has fewer inliers than this, relative to the fundamental matrix, is not
-a plane. Chosen on the data named above."""
+"""A scene is a plane only if the homography has at least this fraction of the fundamental matrix's
+number of inliers. Chosen on the data named above."""
 
 MAX_MEDIAN_MOTION_PX = 0.5
 """Two images show the same view only if the median match moves less than this."""
 
 MAX_MOTION_PX, MOTION_QUANTILE = 3.0, 0.9
-"""Two images show the same view only if this fraction of the matches (second) moves less than the
-first. Chosen on the data named above."""
+"""Two images show the same view only if the motion of the matches, in pixels, is below the first at
+the quantile given by the second. Chosen on the data named above."""
 
 FOREGROUND_DISTANCE_PX = 6.0
-"""A match with a larger transfer error is clearly off the plane."""
+"""A match with a larger transfer error than this, in pixels, is clearly off the plane."""
 
 MIN_FOREGROUND_FRACTION = 0.05
 """There is a foreground only if this fraction of the fundamental matrix's inliers is clearly off
 the plane. Chosen on the data named above."""
 
 MIN_FOREGROUND_ON_LINES = 0.8
-"""This fraction of the matches clearly off the plane must be inliers of the fundamental matrix. On
-sixteen planar pairs of Oxford, where such matches are wrong, it is up to 0.65."""
+"""There is a foreground only if this fraction of the matches clearly off the plane are inliers of
+the fundamental matrix. On sixteen planar pairs of Oxford, without foreground, it is up to 0.65."""
 
 
 def fit_model(
@@ -64,7 +64,7 @@ def fit_model(
     threshold_px: float,
     seed: int = 0,
 ) -> TwoViewModel:
-    """Fit a homography or a fundamental matrix to (M, 2) matches, trusted or not."""
+    """Fit a homography or a fundamental matrix to (M, 2) matches, and measure its evidence."""
     options = GeometryOptions(inlier_threshold=threshold_px)
     geometry = estimate_geometry(points0, points1, model, seed=seed, options=options)
     if geometry.matrix is None:
@@ -81,10 +81,11 @@ def choose_model(
     seed: int,
     semi_calibrated: bool = True,
 ) -> TwoViewModel:
-    """Return the model that may guide matching, trusted or not; many matches may be wrong.
+    """Return the model that may guide matching; many of the matches may be wrong.
 
-    "auto" is the homography, or the fundamental matrix if the matches alone show depth. With
-    `semi_calibrated` this may be that of usual cameras, which needs fewer matches but more time.
+    The caller decides whether to trust the model. "auto" is the homography, or the fundamental
+    matrix if the matches alone show depth. With `semi_calibrated`, the fundamental matrix may come
+    from `estimate_semi_calibrated`, which needs fewer matches but more time.
     """
     plane = TwoViewModel("none", None, np.zeros(len(points0), bool), float("inf"))
     if model != "fundamental":
@@ -145,7 +146,7 @@ def is_planar(
     epipolar: TwoViewModel,
     seed: int = 0,
 ) -> bool:
-    """Return whether a homography explains all that can be explained; many may be wrong."""
+    """Return whether a homography explains the correct matches; many matches may be wrong."""
     least = MIN_PLANAR_RATIO * np.count_nonzero(epipolar.inliers)
     if plane.matrix is None or np.count_nonzero(plane.inliers) < least:
         return False
@@ -157,7 +158,8 @@ def is_planar(
 def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool:
     """Return whether something stands in front of the plane, however small.
 
-    `off_plane_px` are the (M,) transfer errors, `by_fundamental` the fundamental matrix's inliers.
+    `off_plane_px` are (M,) transfer errors, `by_fundamental` the (M,) bool inliers of the
+    fundamental matrix.
     """
     clear = off_plane_px > FOREGROUND_DISTANCE_PX
     foreground = np.count_nonzero(clear & by_fundamental)
@@ -169,7 +171,7 @@ def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool
 
 
 def is_static(motion_px: np.ndarray) -> bool:
-    """Return whether matches that move by these distances show the same view in both images."""
+    """Return whether both images show the same view, by the distances that matches move."""
     motion = np.abs(motion_px)
     return bool(
         np.median(motion) < MAX_MEDIAN_MOTION_PX

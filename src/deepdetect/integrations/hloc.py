@@ -31,7 +31,7 @@ from torch import Tensor
 NAME = "deepdetect"
 
 MAX_KEYPOINTS = np.iinfo(np.int16).max
-"""hloc stores the keypoint indices of matches as int16."""
+"""Maximum number of keypoints: hloc stores the keypoint indices of matches as int16."""
 
 EXTRACTOR_CONF: dict[str, Any] = {
     "output": "feats-deepdetect-n4096",

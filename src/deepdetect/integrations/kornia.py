@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.nn import Module
 
 LAF_SCALE_PER_SIZE = 3.0
-"""A LAF's scale is half the side of the described patch: 6 sigma, or 3 diameters, as in SIFT."""
+"""Scale of a local affine frame (LAF) divided by the keypoint's diameter, which is 2 sigma. The
+scale is half the side of the described patch, 6 sigma as in SIFT."""
 
 
 class DeepDetectDetector(Module):

@@ -129,7 +129,7 @@ class DeepDetectFeature2D:
 
 
 def _ignored(mask: np.ndarray | None) -> np.ndarray | None:
-    """Convert OpenCV's mask, nonzero where keypoints are allowed, to one of ignored pixels."""
+    """Convert OpenCV's mask, nonzero where keypoints are allowed, to a mask of ignored pixels."""
     return None if mask is None else np.asarray(mask) == 0
 
 

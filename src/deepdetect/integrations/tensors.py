@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import torch
 
 OVERSHOOT = 0.25
-"""Tensors may exceed [0, 1] by this much and are clipped: bicubic filters overshoot."""
+"""Tensors may exceed [0, 1] by this much, because bicubic filters overshoot. They are clipped."""
 
 
 def load_tensor(image: Any) -> np.ndarray:

@@ -13,7 +13,8 @@ from .._shared.records import save_arrays
 MAX_UINT16 = 65535
 
 HEADROOM = 4.0
-"""The scale covers this many times the 99th percentile: outliers would make its steps coarse."""
+"""The scale covers depths up to this many times the 99th percentile. If it also covered outliers,
+its steps would be coarse."""
 
 
 def save_depth_png(
@@ -21,10 +22,10 @@ def save_depth_png(
 ) -> dict[str, str | float]:
     """Write a depth map as a 16-bit grey PNG, atomically; return a summary of its content.
 
-    value = round(depth * value_per_unit), and 0 where the depth is unknown: not finite, 0 or less.
+    A pixel is round(depth * value_per_unit), or 0 if the depth is unknown (not finite, 0 or less).
     `value_per_unit` is `scale`. By default it is the finest of 1, 2 or 5 times a power of ten that
-    covers depths up to 4 times the 99th percentile; larger depths, counted as `out_of_range`, are
-    written as unknown. The PNG also has text chunks `unit` and `value_per_unit`.
+    covers depths up to 4 times the 99th percentile. Larger depths are written as unknown, and the
+    summary counts them as `out_of_range`. The PNG has text chunks `unit` and `value_per_unit`.
     """
     known = np.isfinite(depth) & (depth > 0)
     scale = scale or _scale(depth[known])
@@ -53,7 +54,7 @@ def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarra
 
 
 def _scale(depths: np.ndarray) -> float:
-    """Choose the scale that covers all depths except for outliers."""
+    """Choose the scale that covers all depths except outliers (see `HEADROOM`)."""
     if not len(depths):
         return 1.0
     return depth_scale(min(float(depths.max()), HEADROOM * float(np.percentile(depths, 99))))

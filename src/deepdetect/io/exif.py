@@ -12,20 +12,22 @@ from ..geometry.camera import Calibration, Camera, Size
 from .image_file import file_name, is_file, open_image
 
 DIAGONAL_35MM_MM = float(np.hypot(36, 24))
-"""Diagonal of a 35 mm film frame in mm, which the equivalent focal length refers to (CIPA)."""
+"""Diagonal of a 35 mm film frame in mm. The 35 mm equivalent focal length refers to it (CIPA)."""
 
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""Length in mm of a FocalPlaneResolutionUnit: inch, cm; in common use also mm and micrometre."""
+"""Length in mm by FocalPlaneResolutionUnit: inch and cm as in the standard, and mm and micrometre,
+which cameras also use."""
 
 TRANSPOSED = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
 
 MAX_FOCAL_DIFFERENCE = 0.1
-"""The focal length computed from the sensor resolution is finer than the 35 mm equivalent but often
-wrong. It is used if both differ by less than this ratio. Chosen by hand."""
+"""The focal length computed from the sensor resolution is more precise than the 35 mm equivalent
+but often wrong. It is used if their relative difference is below this. Chosen by hand."""
 
 MAX_ASPECT_DIFFERENCE = 0.01
-"""Photographs count as cropped if EXIF's aspect ratio differs by more than this. Chosen by hand."""
+"""A photograph counts as cropped if its aspect ratio differs from EXIF's by more than this. Chosen
+by hand."""
 
 ADVICE = "give `focal_px` or `calibration`"
 

@@ -27,10 +27,10 @@ def write_glb(
 ) -> None:
     """Write the points in glTF's frame with their colours, 20 bytes per point.
 
-    With (M, 3) `faces`, indices of points, it writes a triangle mesh.
+    With (M, 3) `faces`, indices of points, a triangle mesh is written.
 
-    Colours become linear, as glTF requires, in 16 bits, which keep all 256 sRGB levels distinct.
-    The asset's extras contain the metadata, the unit and the frame.
+    Colours are converted to linear values, as glTF requires. They have 16 bits, so that all 256
+    sRGB levels stay distinct. The asset's extras contain the metadata, the unit and the frame.
     """
     # Rotation about the x axis makes y point up: by 180 degrees from a camera's frame, by 90 from
     # one with z up. Units of unknown length are written as metres, and the extras say so.

@@ -27,17 +27,17 @@ MAX_LEVEL = 65535
 """Positions are stored in 16 bits per axis."""
 
 MARGIN = 1.0
-"""Points further outside the robust box than this many times its size are left out: a few very
+"""Points farther outside the robust box than this times its size are left out, because a few very
 distant points would make the quantisation steps coarse for all. Chosen by hand."""
 
 CAMERA_SIZE = 0.35
 """Depth of a camera's pyramid relative to the distance to the nearest camera. Chosen by hand."""
 
 OVERVIEW_RADIANS = (0.4, 0.5)
-"""A page with cameras opens at this azimuth and elevation. Chosen by hand."""
+"""Azimuth and elevation of the first view of a page with cameras. Chosen by hand."""
 
 OVERVIEW_POINTS = 2000
-"""The opening view is fitted to about this many points, for speed. Chosen by hand."""
+"""The first view is fitted to about this many points, for speed. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ def write_html_page(
 def page_points(cloud: PointCloud) -> PagePoints:
     """Quantise positions to 16 bits per axis, without those far outside the robust box."""
     box = robust_box(cloud)
-    # Points on a line or a plane have a flat box: its radius gives the least margin.
+    # The box of points on a line or a plane is flat, so its radius gives a least margin.
     margin = MARGIN * np.maximum(box.high - box.low, box.radius * 1e-3)
     near = ((cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)).all(1)
     points = cloud.points[near].astype(np.float64)
@@ -166,7 +166,7 @@ def _overview(
 
 
 def _largest_slope(cloud: PointCloud) -> float:
-    """Return the tangent of half the field of view that shows nearly all points from the origin."""
+    """Return the tangent of the half field of view in which the origin sees nearly all points."""
     before = cloud.points[cloud.points[:, 2] > 0].astype(np.float64)
     if not len(before):
         return DEFAULT_SLOPE

@@ -39,11 +39,13 @@ MINIMUM_SIDE = 16
 
 ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26
-"""Length of a PNG file's header up to bit depth and colour type; `GREY_PNG` means no alpha."""
+"""Length in bytes of a PNG file's header up to bit depth and colour type. The colour type
+`GREY_PNG` is grey without alpha."""
 GREY_PNG = 0
 
 STRIP_PIXELS = 1 << 20
-"""PIL images are converted in strips of about this many pixels: whole copies take gigabytes."""
+"""PIL images are converted in strips of about this many pixels, because copies of a whole large
+image take gigabytes."""
 
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda image: cv2.flip(image, 1),
@@ -132,7 +134,7 @@ def _load(
     *,
     deep: bool = False,
     raw: bool = False,
-    **for_arrays: Any,  # `options` may come from a command, whose options apply to files only
+    **for_arrays: Any,  # options of a command apply to files only
 ) -> np.ndarray:
     if is_file(image):
         rgb = _read_file(image, options, deep, raw)
@@ -174,7 +176,7 @@ def batch_length(images: Images) -> int:
 
 @contextmanager
 def image_named(number: int) -> Iterator[None]:
-    """Add the index of an image in its list to the errors of the block."""
+    """Add the image's index in its list to the messages of errors in the block."""
     try:
         yield
     except (ImageError, OptionError) as error:
@@ -182,7 +184,7 @@ def image_named(number: int) -> Iterator[None]:
 
 
 def ignore_masks(ignore: Any, images: int) -> list[Any]:
-    """Return the ignore mask of each image: one mask is used for all, a list has one for each."""
+    """Return the ignore mask of each image, from one mask for all images or a list of masks."""
     if not (isinstance(ignore, (list, tuple)) or getattr(ignore, "ndim", 2) == 3):
         return [ignore] * images
     if len(ignore) != images:
@@ -245,9 +247,10 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
 
 
 def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str, Path]:
-    """Return image files, given ones and those below given folders, by their relative names.
+    """Return a dictionary of the given image files and those below the given folders, by name.
 
-    Names are relative to the given folder, or to their common parent if two would be the same.
+    A name is the path relative to the given folder, or, if two would be the same, to the common
+    parent folder.
     """
     names: dict[Path, Path] = {}
     for path in paths:

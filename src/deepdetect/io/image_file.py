@@ -49,7 +49,8 @@ FORMATS = {
     "JXL": ".jxl",  # likewise
     "TGA": ".tga",  # has no signature, so it comes last
 }
-"""Formats that are read, all decoded in this process; EPS is missing as it starts Ghostscript."""
+"""Formats that are read, with their suffixes. All are decoded in this process. EPS is missing
+because decoding it would start Ghostscript."""
 
 _RAW = ".dng .cr2 .cr3 .crw .nef .nrw .arw .sr2 .srf .raf .orf .rw2 .pef .srw .3fr .iiq .erf"
 RAW_SUFFIXES = tuple(f"{_RAW} .mrw .kdc .dcr .mos .mef .x3f .rwl".split())
@@ -62,7 +63,8 @@ UNREAD = {
     b"\x93NUMPY": ("a NumPy array", ""),
     b"DICM": ("a DICOM image", ".dcm"),
 }
-"""First bytes, name and suffixes of formats without a defined value range; the error names them."""
+"""First bytes, name and suffix of formats that are not read, since their value range is undefined.
+The error names the format."""
 
 _OTHERS = (suffixes for _, suffixes in UNREAD.values())
 IMAGE_SUFFIXES = (*" ".join([*FORMATS.values(), *_OTHERS]).split(), *RAW_SUFFIXES)
@@ -72,7 +74,8 @@ MAX_MEGAPIXELS = 200.0
 """Larger images are rejected by default: the largest sensors of phones have 200 megapixels."""
 
 SIGNATURE_BYTES = 132
-"""Formats are recognised by this many first bytes; the signature of DICOM is the last four."""
+"""Formats are recognised by this many first bytes, because DICOM's signature is in bytes 128 to
+131."""
 
 STANDARD_INPUT = "/dev/stdin"
 """Name of standard input on every system; commands accept "-" for it."""
@@ -80,7 +83,7 @@ STANDARD_INPUT = "/dev/stdin"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
-"""HEIF files, which phones write, have one of these in bytes 8 to 11 (ISO/IEC 23008-12)."""
+"""HEIF files, which phones write, have one of these brands in bytes 8 to 11 (ISO/IEC 23008-12)."""
 
 
 @suggest_keywords
@@ -148,7 +151,7 @@ def read_with(options: ReadingOptions) -> Iterator[None]:
 
 
 def reading_options(**given: Any) -> ReadingOptions:
-    """Return the given options that are not None; the others are those of `read_with`."""
+    """Return the options of `read_with`, replaced by the given options that are not None."""
     return replace(_reading.get(), **{n: value for n, value in given.items() if value is not None})
 
 
@@ -198,7 +201,7 @@ def _truncated(allowed: bool) -> Iterator[None]:
 def open_file(source: Any, what: str = "image") -> Iterator[tuple[BinaryIO, str]]:
     """Open a source of `open_image` as a binary file; yield it and its name for errors.
 
-    Pillow's errors in the block become `ImageError`.
+    Errors that Pillow raises in the block become an `ImageError`.
     """
     name = file_name(source, what)
     try:
@@ -300,9 +303,9 @@ def _check_png(file: BinaryIO, name: str) -> None:
 
 
 def identify(file: BinaryIO, name: str) -> Any:
-    """Open a file with the first of `FORMATS` that accepts it.
+    """Open a file with the first format of `FORMATS` that accepts it.
 
-    It replaces `PIL.Image.open`, whose size limit can only be changed for the whole program.
+    `PIL.Image.open` is not used, because its size limit can only be set for the whole program.
     """
     from PIL import Image
 

@@ -14,7 +14,7 @@ from .image import UPRIGHT, orientation_of
 from .image_file import open_image
 
 WHITES = (1, 255, 65535)
-"""White is one of these values: masks of 1, 8 or 16 bits may be stored in files of more bits."""
+"""Values that can be white. A mask of 1, 8 or 16 bits may be stored in a file with more bits."""
 
 
 def save_mask(mask: np.ndarray, path: str | Path) -> None:

@@ -25,7 +25,7 @@ from .image_file import open_file, open_image, reading_options
 from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
-"""Tags of GeoTIFF: every georeferenced file has one of them."""
+"""Tags of GeoTIFF for pixel scale and transformation. A georeferenced file has one of them."""
 
 PLACED_FORMATS = ("TIFF", "JPEG", "PNG", "JPEG2000", "BMP", "GIF")
 """Pillow's names of formats whose georeference GDAL can read."""
@@ -52,7 +52,7 @@ EXIF_TEXTS = (
     Base.Copyright,
 )
 EXIF_DIRECTORIES = (IFD.Exif, IFD.GPSInfo)
-"""EXIF texts and directories that do not depend on how pixels are stored."""
+"""EXIF tags and directories that are kept, since they do not depend on how pixels are stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class Metadata:
     def encode(self, rgb: np.ndarray, suffix: str, settings: list[int]) -> bytes:
         """Return a PNG or JPEG file of an (H, W, 3) RGB image."""
         parts = {cv2.IMAGE_METADATA_ICCP: self._profile_of(b"RGB ")}
-        with suppress(struct.error):  # numbers that Pillow can read but not write
+        with suppress(struct.error):  # EXIF may have numbers that Pillow can read but not write
             if exif := self._exif_of(rgb):
                 parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
         kept = {kind: np.frombuffer(part, np.uint8) for kind, part in parts.items() if part}
@@ -167,7 +167,7 @@ class Metadata:
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
-    """Return whether there are EXIF values that Pillow can write: it reads larger numbers."""
+    """Return whether there are EXIF values, and Pillow can write them: some it can only read."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     directory = ImageFileDirectory_v2()
@@ -261,7 +261,7 @@ def _world_files(path: Path) -> list[Path]:
 
 
 def _kept_exif(exif: Any) -> Any:
-    """Return the EXIF among a TIFF file's tags, without those on how pixels are stored."""
+    """Return the EXIF tags of a TIFF file except those on how pixels are stored."""
     kept = Image.Exif()
     kept.update({code: exif[code] for code in EXIF_TEXTS if code in exif})
     for code in set(EXIF_DIRECTORIES).intersection(exif):
@@ -271,7 +271,7 @@ def _kept_exif(exif: Any) -> Any:
 
 
 def _of_tiff(file: Any) -> tuple[Metadata, Any]:
-    """Return the metadata of a TIFF file except EXIF and place, and the page that is read."""
+    """Return a TIFF file's metadata except EXIF and georeference, and the page that is read."""
     from tifffile import TiffFile
 
     file.seek(0)
@@ -286,7 +286,7 @@ def _of_tiff(file: Any) -> tuple[Metadata, Any]:
 def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
     """Write a (H, W, 3) uint8 or uint16 RGB image as .png, .tif or (with 8 bits) .jpg, atomically.
 
-    The file also contains the metadata.
+    The metadata are written into the file.
     """
     suffix = picture_suffix(path)
     if suffix.startswith(".tif"):

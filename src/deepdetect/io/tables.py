@@ -33,7 +33,7 @@ MATCH_VALUES = (
 """Attributes of matches in npz files, in addition to their keypoints and geometry."""
 
 CSV_ROWS = 100_000
-"""Tables are written by this many rows: one table of all rows would double the memory needed."""
+"""CSV tables are written in blocks of this many rows. All rows at once would double the memory."""
 
 
 @suggest_keywords
@@ -93,8 +93,9 @@ def save_matches(matches: Matches, path: str | Path) -> None:
             `points1` (M, 2) float32, `indices0` and `indices1` (M,) int32 rows of the keypoints,
             `scores` (M,) float32, `inliers` (M,) bool and `subpixel` bool. For each image, here
             the first, it has `keypoints0` (N, 2) float32, `keypoint_scores0` (N,) float32 and
-            `image_size0` (width, height). For a geometry it has the strings `model`, `scene` and
-            `confidence`, `matrix` (3, 3), or (0, 0) if unknown, and the numbers of its `Evidence`.
+            `image_size0` (width, height). If there is a geometry, it has the strings `model`,
+            `scene` and `confidence`, the (3, 3) `matrix`, which is (0, 0) if unknown, and the
+            numbers of `Evidence`.
             A CSV file has the columns x0, y0, x1, y1, score, inlier.
 
     Raises:
@@ -151,9 +152,9 @@ def load_matches(path: str | Path) -> Matches:
 
 @contextmanager
 def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
-    """Yield the arrays of an npz file; those without dimensions become numbers and strings.
+    """Yield the arrays of an npz file by name; arrays without dimensions become numbers or strings.
 
-    Errors, also in the block, name the file and the content that is expected.
+    Errors, also those in the block, name the file and its expected content.
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -168,7 +169,7 @@ def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
 
 
 def _value(array: np.ndarray) -> Any:
-    """Return an array, the value of one without dimensions, or None for an empty (0, 0) matrix."""
+    """Return an array, or its value if it has no dimensions, or None if it is a (0, 0) matrix."""
     if array.shape == (0, 0):
         return None
     return array if array.ndim else array.item()

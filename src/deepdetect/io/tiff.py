@@ -34,7 +34,7 @@ ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
 MAX_BYTES_PER_PIXEL = 256
-"""Files with more bytes per pixel are rejected: a small file can claim any number of bands."""
+"""Files with more bytes per pixel are rejected, since a small file can claim any band count."""
 
 
 def read_tiff(
@@ -177,14 +177,14 @@ def _white(page: Any) -> int | None:
         return (1 << bits) - 1
     values = np.atleast_1d(page.tags.valueof(MAX_SAMPLE_VALUE, 0))
     largest = int(values.max())
-    # By the standard the tag is the largest pixel value; 1 below a power of two it means white.
+    # In the standard the tag is the largest pixel value. If it is 2^n - 1, it tells white.
     return largest if largest > 255 and not largest & (largest + 1) else None
 
 
 def _read_by_pillow(
     file: BinaryIO, stored: list[Any], page: Any, name: str, options: ReadingOptions
 ) -> np.ndarray:
-    """Decode by Pillow what tifffile cannot without imagecodecs, if Pillow decodes it correctly."""
+    """Decode by Pillow what tifffile cannot without imagecodecs; raise if Pillow cannot, either."""
     bits, photometric = page.bitspersample, int(page.photometric)
     plain = page.dtype.kind in ("b", "u") and (
         bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)

@@ -1,1 +1,1 @@
-"""Pictures of keypoints, matches and point clouds."""
+"""Visualisations of keypoints, matches, heat maps and depth maps."""

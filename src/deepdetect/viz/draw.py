@@ -10,10 +10,12 @@ import numpy as np
 from .._shared.opencv import cv2
 
 MAX_CIRCLES = 5000
-"""More keypoints than this are drawn as single pixels: circles would cover the image."""
+"""If there are more keypoints than this, they are drawn as single pixels, because circles would
+cover the image."""
 
 LEAST_RADIUS_PX = 2.0
-"""A keypoint's circle has at least this radius, and a pixel more without size. Chosen by hand."""
+"""Minimum radius of a keypoint's circle. Keypoints without a size get a radius one pixel larger.
+Chosen by hand."""
 
 PICTURE_SIDE_PX = 2000
 """Longest side of a visualisation, in pixels: as JPEG it then takes less than two megabytes."""
@@ -22,22 +24,25 @@ READABLE_WIDTH_PX = 800
 """Captions, lines and points grow in proportion above this image width. Chosen by hand."""
 
 LINES, DOTS = 60, 1500
-"""Numbers of matches drawn as lines and as points if colour shows position. Chosen by hand."""
+"""If colours show positions, the first is the maximum number of matches drawn as lines, the second
+of those drawn as points. Chosen by hand."""
 
 SHOWN_PERCENTILE = 99.0
-"""Colour scales end at this percentile and its opposite, so that outliers do not stretch them."""
+"""Colour scales range from 100 minus this percentile to this percentile of the values, so that
+outliers do not stretch them."""
 
 LEAST_DEPTH_LEVEL = 0.2
-"""Depth uses the colour scale from here: darker colours look like unknown depth. Chosen by hand."""
+"""The farthest depth has this level (0 to 1) of the colour scale, because darker colours look like
+unknown depth. Chosen by hand."""
 
 CAPTION_HEIGHT = 28
 CAPTION_MARGIN = 6
 CAPTION_SCALE = 0.5
-"""The caption of an image of at most `READABLE_WIDTH_PX` has this height and side margin, in
-pixels, and this font scale. Chosen by hand so that it can be read."""
+"""Height and side margin of a caption, in pixels, and OpenCV's font scale, for images up to
+`READABLE_WIDTH_PX` wide. Chosen by hand so that captions are legible."""
 
 GAP_PX = 6
-"""Joined images are separated by gaps of this width. Chosen by hand."""
+"""Joined images are separated by gaps of this width, in pixels. Chosen by hand."""
 
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
@@ -131,8 +136,8 @@ def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
 def draw_logits(logits: np.ndarray) -> np.ndarray:
     """Colour a (H, W) map of logits, with a colour scale below it; 0 is a probability of 0.5.
 
-    A map of probabilities would saturate: they round to 1 in float32 for a sixth of the pixels of
-    a photograph.
+    A map of probabilities would saturate: for a sixth of the pixels of a photograph, float32 rounds
+    the probability to 1.
     """
     shown = fit_picture(np.asarray(logits, np.float32))
     known = np.where(np.isfinite(shown), shown, 0)
@@ -164,7 +169,7 @@ def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
 
 
 def shown_range(values: np.ndarray) -> tuple[float, float]:
-    """Return the values at both ends of the colour scale."""
+    """Return the values at both ends of the colour scale for these values (`SHOWN_PERCENTILE`)."""
     low, high = np.percentile(values, (100 - SHOWN_PERCENTILE, SHOWN_PERCENTILE))
     return float(low), float(high)
 
@@ -218,7 +223,7 @@ def add_scale(
 
 
 def _caption(text: str, width: int, unit: float) -> np.ndarray:
-    """Return a black strip with a line of text that fits it; `unit` comes from `line_scale`."""
+    """Return a black strip with a line of text that fits its width; `unit` is from `line_scale`."""
     strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
     room = width - round(2 * CAPTION_MARGIN * unit)
     if room <= 0:

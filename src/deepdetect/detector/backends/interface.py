@@ -14,7 +14,7 @@ from ..._shared.options import suggest_keywords
 from ..pretrained import LOGITS
 
 PROBE_SHAPE = (24, 32)
-"""Height and width of the image on which a network is tested. Chosen by hand."""
+"""Height and width in pixels of the image that tests a network on loading. Chosen by hand."""
 
 
 class Network(Protocol):
@@ -23,14 +23,15 @@ class Network(Protocol):
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Map (N, 3, H, W) float32 in [0, 1] to (N, 1, H, W) float32 logits, all finite.
 
-        H and W are multiples of 8. Lack of memory is a MemoryError, a wrong output a WeightsError.
+        H and W are multiples of 8. Lack of memory raises a MemoryError, and an output of a wrong
+        shape or type a WeightsError.
         """
 
 
 @suggest_keywords
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """How the network is run: the options of `DeepDetect` of these names."""
+    """How the network is run. The fields are options of `DeepDetect`."""
 
     backend: str = "auto"
     device: str = "cpu"
@@ -39,14 +40,14 @@ class RuntimeOptions:
 
 
 def output_to_read(names: Sequence[str]) -> str:
-    """Return the name of the output to read: the logits, or else the first."""
+    """Return the name of the output to read: the logits if there are any, otherwise the first."""
     return LOGITS if LOGITS in names else names[0]
 
 
 def as_logits(
     output: np.ndarray, name: str, image_shape: tuple[int, ...], path: Path
 ) -> np.ndarray:
-    """Check the output of this name, and convert it to (N, 1, H, W) float32 logits.
+    """Check a network's output, and convert it to (N, 1, H, W) float32 logits.
 
     Probabilities that float32 rounds to 0 or 1 become the logits of the nearest float32 number.
     """
@@ -56,7 +57,7 @@ def as_logits(
             f"{path} does not fit: it gives a {output.dtype} map of shape {output.shape} for an "
             f"image that needs float32 {wanted}; use other weights"
         )
-    low, high = float(output.min()), float(output.max())  # NaN if there is any
+    low, high = float(output.min()), float(output.max())  # the sum is NaN if any value is
     if not (np.isfinite(low) and np.isfinite(high)):
         raise WeightsError(
             f"{path} gives values that are not finite: it is damaged, or its training diverged; "
@@ -92,6 +93,6 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
 
 
 def _reason(error: Exception) -> str:
-    """Return the most telling line of a runtime's message: OpenVINO's start with file names."""
+    """Return the line of a runtime's message with the reason: OpenVINO's begin with file names."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[-1] if lines[0].startswith("Exception from") else lines[0]

@@ -1,7 +1,7 @@
-"""Parts of a network in an ONNX file, cut out at named tensors.
+"""Cutting a part out of the network in an ONNX file, between named tensors.
 
-The package `onnx` could do this, but running a network does not need it. Protobuf, which comes with
-ONNX Runtime, copies fields that are not declared here unchanged.
+Protobuf, which comes with ONNX Runtime, suffices for this, so that the package `onnx` is not needed
+to run a network. Protobuf copies fields that are not declared here unchanged.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FLOAT = 1
 def cut_onnx(model: bytes, inputs: Collection[str], outputs: Collection[str]) -> bytes:
     """Cut out of an ONNX file the part that computes some tensors from others, all float32.
 
-    A KeyError names a tensor that is missing or needs more than the inputs.
+    A KeyError names a tensor that is missing or cannot be computed from the inputs.
     """
     part = _model_class()()
     part.ParseFromString(model)

@@ -21,15 +21,15 @@ from .interface import (
 )
 
 COMPILED_LAYERS = 100
-"""Number of compiled layers that are kept; the least recently used are dropped first. A layer is
-compiled for each image size. OpenVINO's own limit of 5000 fills half a gigabyte if sizes vary."""
+"""Number of compiled layers that OpenVINO caches. The least recently used are dropped. A layer is
+compiled for each image size. OpenVINO's default, 5000, fills 0.5 GB if sizes vary."""
 
 
 class OpenVinoNetwork:
     """A network run by OpenVINO on the CPU.
 
-    After memory was short, the file is read and compiled again: the old model gives wrong results,
-    and one compiled from the same graph crashes.
+    After a lack of memory, the file is read and compiled again: the old model gives wrong results,
+    and a model compiled again from the same graph crashes.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class OpenVinoNetwork:
         except Exception as error:  # its exceptions share no base class
             self._model = None
             raise failed_run(error, image.shape) from None
-        # If memory is short, it may also return nothing, or the map of the previous image.
+        # If memory is short, OpenVINO may also return nothing, or the previous image's map.
         if self._works and output.shape[2:] != image.shape[2:]:
             self._model = None
             raise MemoryError("OpenVINO gave a map of another size")

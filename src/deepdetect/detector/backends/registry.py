@@ -1,4 +1,4 @@
-"""The registry of the backends that can run the network, one line each.
+"""The registry of the backends that can run the network.
 
 To add a backend, write a module in this folder with a function `open_NAME(path, options) ->
 Network`, and add its line here.
@@ -29,13 +29,14 @@ BACKENDS: dict[str, Callable[[Path, RuntimeOptions], Network]] = {
     "onnxruntime": open_onnxruntime,
     "openvino": open_openvino,
 }
-"""Functions that open a file, by the name of the backend, which is also that of its package."""
+"""The function of each backend that opens a file, by the backend's name, which is also the name of
+its package."""
 
 PRECISIONS = ("float32", "bfloat16")
 
 
 def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
-    """Load weights with a suitable backend, and return its name; a few networks are cached."""
+    """Load weights with a suitable backend; return the network and the backend's name, cached."""
     check_name("backend", options.backend, ("auto", *BACKENDS))
     check_name("precision", options.precision, PRECISIONS)
     check_ranges(options, counts=("threads",))
@@ -70,7 +71,7 @@ def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object
 
 
 def _check_answer(network: Network, path: Path) -> None:
-    """Run a network on a small image of noise, to reject a wrong one when it is loaded."""
+    """Run a network on a small noise image, to reject unsuitable weights when they are loaded."""
     # This is noise enough; importing NumPy's generators would take 6 MB.
     numbers = np.arange(3 * math.prod(PROBE_SHAPE), dtype=np.uint16) * np.uint16(40503)
     noise = numbers.reshape(1, 3, *PROBE_SHAPE).astype(np.float32) * np.float32(2**-16)

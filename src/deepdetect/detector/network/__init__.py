@@ -1,1 +1,1 @@
-"""The network as ONNX files for other programs: with a fixed size, with points, with metadata."""
+"""Export of the network as ONNX files for other programs."""

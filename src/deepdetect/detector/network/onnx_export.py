@@ -1,6 +1,6 @@
-"""ONNX files for other programs: for any size or one, with or without points.
+"""ONNX files for other programs: for any image size or a fixed one, with or without points.
 
-Their input is `image`; their outputs are `probability`, `logits` and those of `add_points`.
+Their input is `image`. Their outputs are `probability`, `logits` and the outputs of `add_points`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class OnnxOptions:
     Attributes:
         size: height and width in pixels of a file for this size only, for OpenCV 4 and other
             runtimes without dynamic shapes. None: any height and width.
-        batch: number of images of a file with a size; without a size any number.
+        batch: number of images per run of a file with a size. Without a size any number.
         maps: include the network's probability and logits of all pixels.
         max_keypoints: include this many points of all scales; 0 for none, as OpenCV rejects files
             with points.
@@ -82,10 +82,10 @@ def write_onnx(
     *,
     licence: str | None = None,
 ) -> dict[str, str]:
-    """Write weights as an ONNX file for other programs, all or nothing; return its metadata.
+    """Write weights as an ONNX file for other programs atomically; return its metadata.
 
     The weights are a name, or an ONNX file that this package has written for any size. Without a
-    licence the file keeps that of the given one.
+    new licence, the licence of the weights is kept.
     """
     if Path(path).suffix.lower() != ".onnx":
         raise OptionError(f"the name of an ONNX file ends in .onnx, not {Path(path).name}")
@@ -99,7 +99,7 @@ def write_onnx(
 def write_model(
     model: ModelProto, path: str | Path, options: OnnxOptions, origin: Mapping[str, str]
 ) -> dict[str, str]:
-    """Write a network for any size with options, and notes on its origin; return its metadata."""
+    """Write a network for any size as `options` demand, with notes on its origin as metadata."""
     if options.size is not None:
         fix_size(model, *options.size, options.batch)
     if not options.maps:

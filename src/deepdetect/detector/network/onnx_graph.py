@@ -38,10 +38,10 @@ _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
 
 
 def add_padding(model: ModelProto) -> None:
-    """Let a network, `image` to `logits`, take any size, and output probabilities of at most 1.
+    """Extend a network from `image` to `logits`: accept any size, and also output probabilities.
 
-    The last row and column are repeated up to multiples of 8, and the maps are cropped, as in
-    `compute_maps`. Batch normalisation is folded.
+    The image's last row and column are repeated up to multiples of 8, and the maps are cropped, as
+    in `compute_maps`. Probabilities are at most 1. Batch normalisation is folded.
     """
     from onnx import helper
 
@@ -87,7 +87,7 @@ def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
 
 
 def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
-    """Replace a file's metadata by these values, `METADATA` and the version of this package."""
+    """Replace a file's metadata by `values`, `METADATA` and the version of this package."""
     from onnx import helper
 
     written = {**METADATA, "version": __version__, **values}
@@ -174,8 +174,8 @@ def fold_normalisation(graph: GraphProto) -> None:
 def give_four_dimensions(graph: GraphProto) -> None:
     """Store numbers per channel as (1, C, 1, 1) instead of the equivalent (C, 1, 1).
 
-    Otherwise OpenVINO transposes the image before and after each sum, product or PReLU with one of
-    them, which took a third of the time.
+    For three dimensions OpenVINO transposes the image before and after each sum, product or PReLU
+    with such a constant, which took a third of the time.
     """
     from onnx import numpy_helper
 

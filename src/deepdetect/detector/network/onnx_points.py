@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 PREFIX = "points/"
-"""Prefix of the names of its tensors, except for input and outputs."""
+"""Prefix of the names of all tensors in the graph of the points, except for input and outputs."""
 
 MAX_KEYPOINTS = f"{PREFIX}max_keypoints"
 """Name of the initializer that sets the number of points."""

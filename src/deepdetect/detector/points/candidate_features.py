@@ -1,7 +1,7 @@
-"""The ranker's input for a candidate: measurements relative to its own scale and strength.
+"""The features of a candidate for the ranker, relative to the candidate's own scale and strength.
 
-They hardly change if the image is rotated, zoomed or lit differently, so a ranking by them agrees
-in both images of a pair.
+They hardly change if the image is rotated, zoomed or lit differently, so that the ranker ranks the
+same points high in both images of a pair.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ RING_POINTS = 8
 
 FEATURES = 23 + 8 * len(RING_RADII)
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
-"""Values added before logarithms and divisions, so that noise and rounding have no effect."""
+"""Values added to |det Hessian|, gradients and strengths before logarithms and divisions, so that
+noise and rounding have little effect."""
 
 
 def ring_offsets() -> np.ndarray:
-    """Return (2, L, 2, P) int64 offsets in x and y: of the first points of all rings, and so on.
+    """Return the (2, L, 2, P) int64 offsets of all ring points, in pixels.
 
-    They depend on the level, and on whether the column (or row) of the candidate is odd.
+    The axes are x and y, the level, even or odd column (for y: row) of the candidate, and the
+    points: first the first points of all rings, then the second ones, and so on.
     """
     angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
     reach = SIGMAS_PX[:, None, None, None] * RING_RADII
@@ -39,9 +41,9 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
 
     The first is the scaled logarithm of |det Hessian|. The others are: the same at neighbouring
     scales (one level finer, one and two coarser); blob or saddle; trace and gradient at these
-    scales and its own, and its grey value; the largest |det Hessian| nearby at neighbouring scales,
-    relative to it; mean, maximum and minimum of |det Hessian|, grey value and gradient on rings;
-    its rank among all candidates per pixel; its level.
+    scales and the candidate's own; its grey value; the largest |det Hessian| nearby at neighbouring
+    scales, relative to its own; mean, maximum and minimum of |det Hessian|, grey value and gradient
+    on rings; its rank divided by the number of pixels; its level.
     """
     from .kernels import measure_candidates
 

@@ -1,4 +1,4 @@
-"""The learned descriptor of keypoints: a network of the whole image, sampled at their positions."""
+"""The learned descriptor: a network runs on the whole image and is sampled at the keypoints."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ DESCRIPTOR_GRAPHS = {
     LEARNED_FREE: RANKER.with_name("descriptor_free.onnx"),
     CROSS_MODAL: RANKER.with_name("descriptor_cross_modal.onnx"),
 }
-"""ONNX files that map `luma` (1, 1, H, W) in [0, 1], `xy` (1, N, 2) in pixels and `sizes` (1, N),
-diameters in pixels, to `descriptors` (1, N, 64) of length 1; all are float32."""
+"""ONNX files by descriptor type. Their inputs are `luma` (1, 1, H, W) in [0, 1], `xy` (1, N, 2) in
+pixels and `sizes` (1, N), diameters in pixels. Their output is `descriptors` (1, N, 64), unit
+vectors. All are float32."""
 
 DIGEST_LENGTH = 16
 """Number of characters of the SHA-256 in the type of a user's own descriptor file."""
@@ -47,9 +48,9 @@ def describe_learned(
 ) -> Keypoints:
     """Return keypoints with learned descriptors at their own sizes and angles.
 
-    The image, (H, W) uint8 luma, may be a scaled-down one. Missing angles, or -1, become the
-    dominant ones. The descriptor is a name in `DESCRIPTOR_GRAPHS` or an ONNX file like them.
-    Keypoints without sizes are an OptionError.
+    The image, (H, W) uint8 luma, may be scaled down. Angles that are missing or -1 become dominant
+    angles. The descriptor is a name in `DESCRIPTOR_GRAPHS`, or an ONNX file with the same inputs
+    and output. Keypoints without sizes are an OptionError.
     """
     kind = descriptor_type(descriptor)
     if not len(keypoints):
@@ -78,7 +79,7 @@ def describe_learned(
 
 
 def descriptor_type(descriptor: str | Path) -> str:
-    """Return the `Keypoints.descriptor_type` of a name, or of a file, by its digest."""
+    """Return the `Keypoints.descriptor_type` of a bundled name, or of a file (with its digest)."""
     if str(descriptor) in (*DESCRIPTOR_GRAPHS, ROOT_SIFT):
         return str(descriptor)
     path = resolve_weights(descriptor)
@@ -89,7 +90,7 @@ def descriptor_type(descriptor: str | Path) -> str:
 
 @functools.cache
 def _session(path: Path, content: str, threads: int | None) -> Any:
-    """Start the session of a file, once for each content and number of threads."""
+    """Start the session of a file; it is cached by the file's content and the number of threads."""
     try:
         session = start_session(str(path), threads)
         names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]

@@ -1,4 +1,4 @@
-"""Keypoints of all scales, best first."""
+"""Detection of keypoints of all scales, best first."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Spread = Literal["none", "grid", "anms"]
 SPREADS = ("none", "grid", "anms")
 
 CANDIDATES_PER_KEYPOINT, MIN_CANDIDATES = 6, 8192
-"""Only this many of the strongest candidates per keypoint, and at least the second number, are
-ranked, unless all keypoints are wanted or they are spread. Half as many candidates per keypoint
-save 7 of 56 ms at 640x480, but cost 0.01 of repeatability at 3 px."""
+"""The ranker gets the strongest candidates: the first number per wanted keypoint, and at least the
+second in all. It gets every candidate if all keypoints are wanted, or if they are spread. Half the
+first number would save 7 of 56 ms at 640x480, but cost 0.01 of repeatability at 3 px."""
 
 TILE_PX = 32
 """Candidates of all scales are processed in tiles of this side, for the cache. Chosen by hand."""
@@ -34,7 +34,7 @@ GRID_CELLS = 16
 """Number of cells along the longer side for the spread "grid". Chosen by hand."""
 
 DISTANCE_PX = 2.0
-"""Minimum distance of keypoints. 1.5 and 2.3 px changed the ranker's score by less than 0.003."""
+"""Minimum distance of keypoints. 1.5 and 2.3 px change the ranker's score by less than 0.003."""
 
 DISTANCE_PER_SIGMA = 1.0
 """Minimum distance of two keypoints relative to the smaller one's sigma, so that one structure is
@@ -45,7 +45,7 @@ SIZE_PER_SIGMA = 2.5
 
 
 def least_distances(sigma_px: np.ndarray) -> np.ndarray:
-    """Return (N,) radii within which a keypoint suppresses others of its size or larger."""
+    """Return (N,) radii within which a keypoint suppresses keypoints of its size or larger."""
     radii: np.ndarray = np.maximum(DISTANCE_PX, DISTANCE_PER_SIGMA * sigma_px)
     return radii
 
@@ -60,9 +60,10 @@ def detect_points(
 ) -> Keypoints:
     """Detect keypoints of all scales in a (H, W) uint8 image, best first, as in `PointDetector`.
 
-    Their logits rank them, and so do their scores in (0, 1), which are all different.
+    The logits are those of the ranker. The scores, in (0, 1) and all different, have the same
+    order.
     """
-    # With only the strongest candidates nothing could be spread over dim regions.
+    # The strongest candidates alone could not be spread over regions of low contrast.
     limit = max_keypoints if spread == "none" else None
     strongest = None if limit is None else max(CANDIDATES_PER_KEYPOINT * limit, MIN_CANDIDATES)
     candidates, logits = rank_candidates(gray, strongest, ignore=ignore, ranker=ranker)
@@ -100,7 +101,7 @@ def rank_candidates(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
     rows = rows[:strongest]
-    # Those of all scales in one tile share the processor's cache.
+    # Candidates of all scales in one tile share the processor's cache.
     tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
     candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
     return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))

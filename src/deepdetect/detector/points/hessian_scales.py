@@ -10,14 +10,14 @@ from ..._shared.opencv import cv2
 from ...features.selection import descending_order, peak_offset
 
 NMS_RADIUS = 2
-"""A candidate is the maximum of a window of 5x5 pixels in its level. Chosen by hand."""
+"""A candidate is the maximum within this distance in x and y in its level. Chosen by hand."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
 """Sigmas of the Gaussians of all levels, in pixels: seven levels with candidates, and one finer and
 two coarser ones, which only the ranking uses. Chosen by hand."""
 
 VARIANCES = (SIGMAS_PX**2).astype(np.float32)
-"""Variances of these Gaussians, which normalise derivatives."""
+"""Squares of `SIGMAS_PX`, which normalise the derivatives."""
 
 LEAST_RESPONSE = 1e-8
 """Minimum response of a candidate, in an image with values in [0, 1]: anything less is rounding."""
@@ -58,7 +58,7 @@ class Candidates:
         return len(self.level)
 
     def __getitem__(self, rows: np.ndarray) -> Candidates:
-        """Return some of them, by a mask or by rows."""
+        """Return the candidates chosen by a mask or by rows."""
         return Candidates(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 

@@ -1,6 +1,6 @@
-"""Compiled parts of the detection of points: derivatives, measurements of candidates.
+"""Compiled functions for the detection of points: derivatives and features of candidates.
 
-Loops over neighbours in memory are written so that the compiler vectorises them.
+Inner loops run over adjacent memory, so that the compiler vectorises them.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ _POINTS = RINGS * RING_POINTS
 
 @compiled(nogil=True, error_model="numpy")
 def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def]
-    """Compute the determinant of the Hessian, normalised by the variance.
+    """Compute the determinant of the scale-normalised Hessian of a (H, W) float32 image.
 
-    It uses central differences of a (H, W) float32 image that is mirrored at its outermost pixels.
+    The derivatives are central differences. The image is mirrored at its outermost pixels.
     """
     height, width = smooth.shape
     scale = variance * variance
@@ -66,9 +66,8 @@ def measure_candidates(  # type: ignore[no-untyped-def]
 ):
     """Compute the features of some candidates, except those that `describe_candidates` adds.
 
-    The maps are flat, with `shape` (L, H, W). `rings` holds (2, L, 2, R P) offsets in x and y: of
-    the first points of all rings, then of their second points and so on, by level and by whether
-    the column (or row) is odd. `candidates`, (N, 3), holds level, row and column.
+    The maps of `shape` (L, H, W) are flattened. `rings` are the offsets of `ring_offsets`.
+    `candidates`, (N, 3), holds level, row and column.
     """
     levels, height, width = shape
     floor, slope_floor, strength_floor = floors
@@ -76,7 +75,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
     steps, values = np.empty((3, _POINTS), np.int64), np.empty((3, _POINTS), np.float32)
     places, right, down = steps[0], steps[1], steps[2]
     response, slope, light = values[0], values[1], values[2]
-    # In this order: itself; three neighbours, the highest there; four gradients; the rings.
+    # Order: the candidate, three neighbouring scales, their maxima, four gradients, rings.
     logs, bent = np.empty(11 + 7 * RINGS, np.float32), np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
         level, row, column = candidates[n, 0], candidates[n, 1], candidates[n, 2]

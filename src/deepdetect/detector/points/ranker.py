@@ -21,10 +21,10 @@ _CHUNK = 2048
 
 @dataclass(frozen=True, eq=False)
 class Ranker:
-    """Weights of the ranker: a logit is the first feature plus a perceptron of all features.
+    """Weights of the ranker: a logit is the first feature plus the output of a perceptron of all.
 
-    Features are normalised by mean and deviation. Layers are weights (outputs, inputs) and biases,
-    with ReLU between them.
+    Features are normalised by their mean and standard deviation. Each layer has weights (outputs,
+    inputs) and biases, with ReLU between the layers.
     """
 
     mean: np.ndarray
