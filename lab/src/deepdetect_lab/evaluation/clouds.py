@@ -17,8 +17,8 @@ DPI = 100
 """Pixels to an inch, in which matplotlib counts."""
 
 POINT_AREA = 1.5
-"""Area of a drawn point, in units of (1/72 inch)^2. It is 1.7 pixels wide, so that a surface with one
-point per image pixel has no gaps in side views."""
+"""Area of a drawn point, in units of (1/72 inch)^2. It is 1.7 pixels wide, so that a surface with
+one point per image pixel has no gaps in side views."""
 
 ZOOM = 2.2
 """Zoom of the plot; at 1 the robust box of a cloud fills less than half of the figure's width."""
