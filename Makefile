@@ -168,7 +168,7 @@ $(VENV)/bin/uv: requirements/uv.txt
 	@touch $@
 
 $(VENV)/.demo: $(VENV)/bin/uv uv.lock
-	$(call sync,$(VENV)) --group demo
+	$(call sync,$(VENV)) --group demo --group opencv5
 	@touch $@
 
 # It holds what the demonstration needs, too.
@@ -179,9 +179,9 @@ $(VENV)/.test: $(VENV)/bin/uv uv.lock
 
 # An environment for each of the other targets.
 .venv-opencv4/.test: GROUPS := $(EVERYTHING) --group test --group opencv4
-.venv-ray/.test: GROUPS := --group test --group ray
+.venv-ray/.test: GROUPS := --group test --group opencv5 --group ray
 .venv-integrations/.test: GROUPS := $(EVERYTHING) --group test --group opencv5 --group integrations
-.venv-docs/.test: GROUPS := --group docs --group test --group release --group build
+.venv-docs/.test: GROUPS := --group opencv5 --group docs --group test --group release --group build
 .venv-opencv4/.test .venv-ray/.test .venv-integrations/.test .venv-docs/.test: .venv-%/.test: $(VENV)/bin/uv uv.lock
 	$(call sync,.venv-$*) $(GROUPS)
 	$(if $(filter opencv4 integrations,$*),$(call install_torch,.venv-$*))

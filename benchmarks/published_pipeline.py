@@ -21,15 +21,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
-from deepdetect import (
-    DeepDetect,
-    MissingExtraError,
-    WeightsError,
-    load_image,
-)
+from deepdetect import DeepDetect, load_image
 from deepdetect.detector import HeatmapOptions
-from deepdetect.detector.pretrained import PRETRAINED
 from deepdetect.geometry import disparity_errors, transform_points
 from deepdetect_lab.datasets.middlebury import StereoPair, load_middlebury
 from deepdetect_lab.datasets.planar import PlanarPair, load_oxford
@@ -38,6 +33,7 @@ from deepdetect_lab.evaluation.protocols.paper import CORRECT_PX
 from deepdetect_lab.evaluation.protocols.planar import select_pairs
 from deepdetect_lab.evaluation.report import Row, Table
 from deepdetect_lab.evaluation.unguided import UPRIGHT_SIFT, match_unguided
+from deepdetect_lab.networks.weights import find_weights, load_network
 
 PLANAR = (("wall", 6), ("graf", 3))
 STEREO = "cones"
@@ -154,23 +150,16 @@ def _sides(
 
 
 def published_detector(detector: DeepDetect) -> DeepDetect:
-    """Return a detector with the same weights, run by torch without compilation.
+    """Return a detector with the same weights of the package, run by torch without compilation."""
+    network = load_network(find_weights(detector.weights.stem))
 
-    Raises:
-        WeightsError: the folder of the weights has no safetensors file of the same name.
-        MissingExtraError: torch is not installed.
-    """
-    weights = detector.weights.with_suffix(".safetensors")
-    if not weights.is_file():
-        raise WeightsError(
-            f"the published pipeline runs in torch and needs {weights}, which is missing: give a "
-            f"safetensors file, or one of {', '.join(PRETRAINED)}"
-        )
-    try:
-        found = DeepDetect(weights, backend="torch")
-    except MissingExtraError as error:
-        raise MissingExtraError(f"the published pipeline cannot be run: {error}") from None
-    return found.configured(detector.heatmap_options)
+    def run(image: np.ndarray) -> np.ndarray:
+        with torch.inference_mode():
+            return network(torch.from_numpy(image)).numpy()
+
+    found = detector.configured(detector.heatmap_options)
+    found._network = run
+    return found
 
 
 def published_pipeline(images: Images, detector: DeepDetect, correct: Judge) -> int:

@@ -56,16 +56,16 @@ STAGES = {
             "low-visibility": "low-visibility --protocol paper" + XFEAT,
             "oxford-espnet": "oxford --protocol paper --baselines none --weights espnet",
             "oxford-published": "oxford --protocol paper --baselines none --preset published "
-            "--weights {published}/published_matching.safetensors",
+            "--weights {published}/published_matching.onnx",
             "middlebury": "middlebury --geometry-weights dense "
-            "--geometry-weights {published}/published_reconstruction.safetensors",
+            "--geometry-weights {published}/published_reconstruction.onnx",
             "pose": "pose --baselines sift,orb --max-pairs 45" + XFEAT + E64,
             "sfm": "sfm",
         }.items()
     },
     "label-prediction": "-m deepdetect dev evaluate {data}/label-samples/val --json --scale 0.5 "
     "--scale 2 --compare espnet --compare free "
-    "--compare {published}/published_matching.safetensors",
+    "--compare {published}/published_matching.onnx",
     "validation": "benchmarks/validation_photographs.py {data}/photos/val --weights default "
     "--weights espnet",
     "labels-stereo": "-m deepdetect dev evaluate-stereo {data}/middlebury/cones "
@@ -328,7 +328,7 @@ def main() -> None:
     """Run the chosen benchmarks, then fill the blocks."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("data", nargs="?", type=Path, help="folder of the data sets")
-    parser.add_argument("--published", type=Path, help="folder of others' weights")
+    parser.add_argument("--published", type=Path, help="folder of others' weights, as ONNX files")
     parser.add_argument("--only", nargs="+", choices=sorted(RESULTS), default=sorted(RESULTS))
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "results")
     parser.add_argument("--check", action="store_true", help="compare the blocks, fill none")

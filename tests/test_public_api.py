@@ -76,7 +76,7 @@ def test_importing_does_no_work() -> None:
     ],
 )
 def test_modules_import_no_heavy_package_that_they_may_not_need(module: str) -> None:
-    code = f"import json, sys, deepdetect.{module}; print(json.dumps(sorted(sys.modules)))"
+    code = f"import json, sys, {module}; print(json.dumps(sorted(sys.modules)))"
     loaded = set(in_a_fresh_interpreter(code))  # type: ignore[call-overload]
     assert not loaded & (HEAVY - {"cv2", "numpy"})
 

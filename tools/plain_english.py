@@ -48,9 +48,7 @@ PHRASES = {
     r"\bread wrongly\b": "'misread'",
     r"\bit is needed\b(?=\.)": "say when",
     r"\bas (?:it is )?told\b": "'as you set'",
-    r"\b(?:has|have|had|does|do|did|is|are) (?:not|none)(?=[.;:,)])": (
-        "finish the clause: 'does not have one'"
-    ),
+    r"\b(?:has|have|had) (?:not|none)(?=[.;:,)])": ("finish the clause: 'does not have one'"),
     r"\bis none of\b|\bare none of\b": "'is not one of'",
     r"\bhangs? together\b": "'are connected', 'overlap'",
     r"\bsatellite fix": "'GPS'",

@@ -90,6 +90,10 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
             Keypoints.from_opencv,
             {"keypoints": found.to_opencv(), "image_size": (112, 96)},
         ),
+        "Matches.with_geometry": (
+            matches.with_geometry,
+            {"found": deepdetect.estimate_geometry(matches)},
+        ),
         "Matches.draw": (matches.draw, {"image0": scene, "image1": scene}),
         "project": (camera.project, {"points": np.ones((4, 3))}),
         "rays": (camera.rays, {"points": xy}),
@@ -102,16 +106,14 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
         "match_images": (deepdetect.match_images, pair),
         "register": (deepdetect.register, pair),
         "stitch": (deepdetect.stitch, {"images": [scene, scene], "detector": points}),
-        "disparity_map": (deepdetect.disparity_map, {"left": scene, "right": scene}),
-        "reconstruct": (
-            deepdetect.reconstruct,
-            {"left": scene, "right": scene, "detector": points, "focal_px": 100.0},
-        ),
+        "disparity_map": (deepdetect.disparity_map, {"image0": scene, "image1": scene}),
+        "reconstruct": (deepdetect.reconstruct, pair | {"focal_px": 100.0}),
+        "estimate_pose": (deepdetect.estimate_pose, pair | {"focal_px": 100.0}),
     }
 
 
-MATCHES = ("points0", "points1", "scores", "inliers", "model", "matrix", "keypoints0", "keypoints1")
-SLOW = ("match_images", "register", "stitch", "disparity_map", "reconstruct")
+MATCHES = ("points0", "points1", "scores", "inliers", "keypoints0", "keypoints1")
+SLOW = ("match_images", "register", "stitch", "disparity_map", "reconstruct", "estimate_pose")
 
 
 def called(generator: np.random.Generator, folder: Path) -> None:

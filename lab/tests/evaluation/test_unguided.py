@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
@@ -110,12 +111,12 @@ def test_a_constant_image_has_no_matches(photo: np.ndarray, constant: tuple[bool
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scene", "correct"), [("leuven", 58_946), ("ubc", 39_891)])
-def test_the_published_system_is_reproduced(shared: Path, scene: str, correct: int) -> None:
+def test_the_published_system_is_reproduced(
+    shared: Path, published: Callable[[str], Path], scene: str, correct: int
+) -> None:
     """Correct matches of images 1 and 6 as measured with the authors' own code."""
-    pytest.importorskip("torch")
     folder = shared / "data" / "oxford" / scene
-    weights = shared / "reference" / "published_matching.safetensors"
-    detector = DeepDetect(weights, resolution=480, network_channels="bgr")
+    detector = DeepDetect(published("matching"), resolution=480, network_channels="bgr")
     matches = match_unguided(folder / "img1.png", folder / "img6.png", detector)
     errors = transfer_errors(matches.points0, matches.points1, np.loadtxt(folder / "H1to6p"))
     assert np.count_nonzero(errors < 1) == pytest.approx(correct, rel=0.03)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -71,12 +72,13 @@ def test_shifted_images_repeat_and_match(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_pretrained_weights_are_as_dense_as_the_paper_s(shared: Path) -> None:
+def test_the_pretrained_weights_are_as_dense_as_the_paper_s(
+    shared: Path, published: Callable[[str], Path]
+) -> None:
     """All 48 images of Oxford: within 0.04 at each threshold."""
-    published = shared / "reference" / "published_matching.safetensors"
     squashing = [
         detector.configured(HeatmapOptions(480))
-        for detector in (DeepDetect(), DeepDetect(published))
+        for detector in (DeepDetect(), DeepDetect(published("matching")))
     ]
     images = [path for scene in load_oxford(shared / "data" / "oxford") for path in scene.images]
     maps = [[detector.heatmap(path) for path in images] for detector in squashing]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +40,11 @@ def test_pyramid_branches_are_running_sums_of_the_dilated_convolutions() -> None
 
 
 @pytest.mark.slow
-def test_published_weights_score_as_published(shared: Path) -> None:
-    weights = shared / "reference" / "published_matching.safetensors"
+def test_published_weights_score_as_published(
+    shared: Path, published: Callable[[str], Path]
+) -> None:
     samples = sample_images(shared / "data" / "label-samples" / "val")
-    scores = score_samples(DeepDetect(weights).heatmap, map(load_sample, samples))
+    scores = score_samples(DeepDetect(published("matching")).heatmap, map(load_sample, samples))
     # BCE and IoU of notes/published-system.md.
     assert scores["normal"].loss == pytest.approx(0.1028, abs=0.002)
     assert scores["normal"].iou == pytest.approx(0.854, abs=0.002)

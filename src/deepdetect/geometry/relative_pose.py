@@ -12,28 +12,28 @@ from .estimation import GeometryOptions, estimate_geometry
 from .transforms import epipolar_errors, signed_epipolar_errors
 
 Pose = tuple[np.ndarray, np.ndarray]
-"""Rotation (3, 3) and translation (3,): X1 = rotation @ X0 + translation."""
+"""A pose is a rotation (3, 3) and a translation (3,): X1 = rotation @ X0 + translation."""
 
 BLOCK = 100_000
-"""Matches that are triangulated at once: a score of arrays of millions would fill the memory."""
+"""Number of matches triangulated at once: some twenty arrays of this length are held in memory."""
 
 MAX_ITERATIONS = 10
-"""Of Gauss-Newton."""
+"""Gauss-Newton stops after this many steps. Chosen by hand."""
 
 DERIVATIVE_STEP = 1e-6
-"""By which the pose is varied for its derivatives, in radians."""
+"""Numerical derivatives vary the pose by this angle, in radians."""
 
 MIN_CHANGE = 1e-9
-"""A smaller change of the pose, in radians, ends the refinement."""
+"""The refinement ends when the pose changes by less than this angle, in radians."""
 
 MAX_REFITS = 4
-"""How often the pose is fitted to its own inliers again ..."""
+"""The pose is fitted to its own inliers again at most this many times. Chosen by hand."""
 
 MIN_INLIER_GAIN = 0.01
-"""... while that gives this fraction of further inliers."""
+"""A fit is repeated while the number of inliers grows by this fraction. Chosen by hand."""
 
 MAX_MATCHES = 50_000
-"""That are used, sampled evenly: more do not improve the pose."""
+"""The pose is fitted to this many evenly sampled matches: more do not improve it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ def triangulate(
 
     Both positions are first moved onto a pair of epipolar lines (`correct_matches`): this is the
     maximum likelihood for errors of the same size in both images. The rays then meet, and the depth
-    is a quotient, accurate at small angles too.
+    is a quotient, accurate even at small angles.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -143,7 +143,7 @@ class RelativePose:
 
 
 def rotation_angle(rotation: np.ndarray) -> float:
-    """Return the angle of a rotation in degrees, accurate for small angles, too."""
+    """Return the angle of a rotation in degrees, accurate even for small angles."""
     skew = (rotation - rotation.T)[[2, 0, 1], [1, 2, 0]]
     return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(rotation) - 1)))
 

@@ -25,38 +25,40 @@ MODELS_PER_SAMPLE = 10
 """Five matches give up to ten essential matrices."""
 
 START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
-"""In units of the longer side: from which a fit begins, that of the nearest essential matrix."""
+"""A fit starts from one of these focal lengths, in units of the longer side: the one whose
+essential matrix is nearest. Chosen by hand."""
 
 MIN_MATCHES = 6
-"""One more than give an essential matrix."""
+"""An essential matrix needs five matches; one more is needed to judge it."""
 
 FOCAL_LENGTHS = (0.7, 1.4)
-"""That are tried, in units of the longer side of the image: as good as all from a wide angle of 90
-degrees to a telephoto lens of 28."""
+"""Focal lengths that are tried, in units of the longer side of the image. The two are as good as a
+dense range from a wide angle of 90 degrees to a telephoto lens of 28."""
 
 CONFIDENCE = 0.9999
-"""Desired probability that a model is the best one."""
+"""RANSAC stops when the best model has been found with this probability."""
 
 ITERATIONS = 5000
-"""Maximum number for each focal length."""
+"""RANSAC draws at most this many samples for each focal length. Chosen by hand."""
 
 FOCAL_SPREAD = 0.7
-"""Standard deviation of the focal length from one longer side, as a factor's natural logarithm."""
+"""Prior standard deviation of ln(focal length / longer side). Chosen by hand."""
 
 FOCAL_DIFFERENCE = 0.03
-"""The same of one camera's focal length from the other's."""
+"""Prior standard deviation of ln(focal length 0 / focal length 1). Chosen by hand."""
 
 PRINCIPAL_POINT_SPREAD = 0.03
-"""Standard deviation of the principal point from the middle of the image, in longer sides."""
+"""Prior standard deviation of the principal point from the image centre, in longer sides. Chosen
+by hand."""
 
 MATCH_SIGMA_PX = 0.5
-"""Standard deviation of right matches from their epipolar lines."""
+"""Standard deviation of correct matches from their epipolar lines, in pixels. Chosen by hand."""
 
 MAX_FITS = 4
-"""How often pose and cameras are fitted to the matches that agree with them."""
+"""Pose and cameras are fitted to their own inliers at most this many times. Chosen by hand."""
 
 MAX_ITERATIONS = 20
-"""Of each fit (Levenberg-Marquardt)."""
+"""Levenberg-Marquardt stops after this many steps. Chosen by hand."""
 
 
 def estimate_semi_calibrated(

@@ -130,7 +130,10 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def check_upright(paths: Iterable[Path]) -> None:
-    """Raise an OptionError for images that EXIF rotates, which some programs ignore."""
+    """Raise an OptionError for images that EXIF rotates, for programs that ignore this.
+
+    Images that cannot be read are not checked.
+    """
     for path in paths:
         try:
             with open_image(path) as image:

@@ -43,13 +43,10 @@ from .two_view import checked_pose, reconstruct_two_view, refined_corners
 SOR_WINDOW_PX = 9
 """SOR of rectified pairs compares a pixel with those in a window of this side. Chosen by hand."""
 
-MIN_UNIQUE_FRACTION = 0.1
+MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
 """This fraction of the keypoints must have a unique match on their row: for unrelated images it was
-up to 0.005, for rectified pairs at least 0.35."""
-
-MIN_MATCHED_FRACTION = 0.25
-"""This fraction must have a match if matches need not be unique: for unrelated images it was up to
-0.16, for rectified pairs at least 0.64."""
+up to 0.005, for rectified pairs at least 0.35. The second fraction must have a match if matches
+need not be unique: it was up to 0.16, and at least 0.64."""
 
 
 @suggest_keywords

@@ -52,10 +52,6 @@ look down rather than up. Chosen by hand."""
 MAX_DISTANCE_PX = 15.0
 """A named pixel means the point of the model that is seen within this distance. Chosen by hand."""
 
-SAME_PLACE_PX = 2.0
-"""Points up to this much farther from the pixel than the closest one are also candidates, of which
-the one nearest to the camera is taken, since it hides the others. Chosen by hand."""
-
 NEARLY_A_LINE = "they lie nearly on a line: the rotation of the model about it follows from the \
 assumption that cameras are held upright"
 
@@ -394,7 +390,8 @@ def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
             f"the model has no point within {MAX_DISTANCE_PX:g} pixels of {end}: name a pixel with "
             "more texture around it"
         )
-    near = np.flatnonzero(distances < distances.min() + SAME_PLACE_PX)
+    # The nearest point to the camera hides others that are about as close to the pixel.
+    near = np.flatnonzero(distances < distances.min() + 2)
     return np.asarray(points[near[depth[near].argmin()]], np.float64)
 
 

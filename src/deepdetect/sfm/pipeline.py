@@ -76,8 +76,8 @@ def reconstruct_many(
         output: folder for the results.
         detector: detector of the keypoints. None: a `PointDetector` of 8,192 points.
         selection: which keypoints are kept, as in `extract_features`.
-        calibration: file of the cameras, which are kept fixed. A `Calibration` or `Camera` also works.
-            Without one, focal length and distortion are estimated.
+        calibration: file of the cameras, which are kept fixed. A `Calibration` or a `Camera` also
+            works. Without one, focal length and distortion are estimated.
         focal_px: rough focal length of all images in pixels; by default from EXIF, or a guess.
         seed: seed of all random choices; COLMAP's threads may still cause small differences.
         options: options of all stages.

@@ -36,12 +36,9 @@ MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
 """A new point has this distance from all tracks, in pixels and as a share of the spacing of a grid
 of `max_keypoints` points: points all over the image tell more about the motion of the camera."""
 
-WINDOW_PX = 21
-"""The patch that is followed has this side, which is OpenCV's default."""
-
-LEVELS = 3
-"""The pyramid has this number of levels above the image, as by default in OpenCV; each one doubles
-how far points may move between frames."""
+WINDOW_PX, LEVELS = 21, 3
+"""The patch that is followed has this side, and the pyramid this number of levels above the image,
+each of which doubles how far points may move between frames. Both are OpenCV's defaults."""
 
 BORDER_PX = 2.0
 """Points nearer to the border of the image are dropped. Chosen by hand."""

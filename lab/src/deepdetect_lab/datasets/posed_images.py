@@ -30,10 +30,10 @@ from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 MAX_ROTATION_ERROR = 1e-3
-"""The largest difference of a rotation's columns from orthonormal ones: files have few digits."""
+"""Rotations may deviate from orthonormal matrices by this much, since files have few digits."""
 
 MAX_ASPECT_ERROR = 0.01
-"""The largest difference of the aspect ratios of an image and its camera: sizes are rounded."""
+"""Aspect ratios of image and camera may differ by this fraction, since sizes are rounded."""
 
 COLMAP_FILES = ("images.bin", "images.txt")
 

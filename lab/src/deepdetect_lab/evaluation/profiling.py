@@ -18,19 +18,19 @@ Outcome = TypeVar("Outcome")
 
 @dataclass
 class Profile:
-    """What a piece of work took: wall time, and bytes that the process grew by at most."""
+    """Wall time of some work, and the largest growth of the process's memory in bytes."""
 
     seconds: float = 0.0
     memory: float = 0.0
 
 
 _highest = 0
-"""The highest of the peaks that were forgotten."""
+"""The highest peak that was reset, in bytes."""
 
 
 @contextmanager
 def profiled() -> Iterator[Profile]:
-    """Measure the time and the growth of memory of a block, which are known when it has ended.
+    """Measure time and memory growth of a block; read the values after the block.
 
     The memory is exact on Linux, which is told to forget the peak where a block begins; elsewhere a
     peak counts where it is the highest of the process so far. No two blocks may run at a time.

@@ -45,8 +45,8 @@ def mean_of(values: Iterable[float | None]) -> float | None:
 class Table:
     """A table whose key, for example "oxford_matches", is the name of its file.
 
-    The columns say how numbers are written, as ".3f", ",d" or ".1%", by title. The rows have cells
-    by title; one that is missing, None or NaN is a dash.
+    The columns give the format specification of their numbers, such as ",d", by title. The rows
+    have cells by title; one that is missing, None or NaN is a dash.
     """
 
     key: str

@@ -72,7 +72,7 @@ class MatchSettings:
 class PairMatches:
     """The (M, 2) matched positions of a pair, and the positions of all keypoints used.
 
-    With the seconds that describing both images and matching took when it was done.
+    `seconds` is the time of description and matching when they were computed.
     """
 
     points0: np.ndarray
@@ -184,7 +184,7 @@ class Run:
         return {name: value if value.ndim else value.item() for name, value in kept.items()}
 
     def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, float]:
-        """Find the keypoints of an image and the seconds it took, or read both from the cache."""
+        """Return the keypoints of an image and the seconds of detection, cached if possible."""
         name = f"{feature.detection} {file_digest(image)}"
         if name not in self._recent:
             self._recent[name] = self._keypoints(feature, image)
@@ -238,7 +238,7 @@ class Run:
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
     ) -> tuple[list[np.ndarray], float]:
-        """Describe both images; those of the last pair are kept for other settings of matching."""
+        """Describe both images; the last pair's descriptors are kept for other match settings."""
         name = key(*feature.key, images, [len(keypoints) for keypoints in both])
         if self._described is None or self._described[0] != name:
             self._described = None  # frees memory before new descriptors are computed

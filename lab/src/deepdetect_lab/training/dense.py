@@ -1,4 +1,4 @@
-"""The training of the network: crops with labels, the loss of each pixel, the validation."""
+"""Training of the detector network: labelled crops, loss per pixel, validation."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ONNX = "deepdetect.onnx"
 def initial_network(
     options: TrainingOptions, init_weights: InitWeights | None
 ) -> tuple[TrainingOptions, nn.Module]:
-    """Make the network with its initial weights, and resolve the options that depend on them."""
+    """Make the network with initial weights, and resolve options that depend on them."""
     make = look_up("network", options.network, NETWORKS)
     if init_weights is not None:
         if options.frozen_batch_norm is None:
@@ -65,7 +65,7 @@ def initial_network(
 
 
 class DenseTrainer(Trainer):
-    """A network that maps images to heat maps, with its initial weights, and labelled images."""
+    """Training of a network from images to heat maps, on labelled images."""
 
     objective, sign = "validation_loss", 1
     purpose = "that maps RGB in [0, 1] to the probability that a label detector marks a pixel"
@@ -93,7 +93,7 @@ class DenseTrainer(Trainer):
         self.bfloat16 = device.precision == "bfloat16" or (
             device.precision == "auto" and _computes_bfloat16(kind)
         )
-        # channels_last is faster by 40 % on CPUs, and what tensor cores want.
+        # channels_last is 40 % faster on CPUs, and suits tensor cores.
         self.network = network.to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval()
@@ -119,24 +119,24 @@ class DenseTrainer(Trainer):
     def _set_up(self) -> nn.Module:
         if not self.compiled:
             return self.network
-        # Not dynamic: there are only as many shapes as stages, and each gets its own code.
+        # Not dynamic, because each stage has one shape, which gets its own code.
         return torch.compile(self.network, dynamic=False)  # type: ignore[return-value]
 
     def to_device(self, values: Tensor) -> Tensor:
-        """Copy a tensor to the device, without waiting where it is pinned."""
+        """Copy a tensor to the device, asynchronously if it is pinned."""
         return values.to(self.device, non_blocking=True)
 
     def to_float(self, images: Tensor) -> Tensor:
-        """Turn (B, H, W, 3) uint8 into (B, 3, H, W) float32 in [0, 1] on the device."""
+        """Convert (B, H, W, 3) uint8 to (B, 3, H, W) float32 in [0, 1] on the device."""
         return self.to_device(images).permute(0, 3, 1, 2).float().div_(255)
 
     def logits(self, images: Tensor) -> Tensor:
-        """Run the network for training; logits are float32."""
+        """Run the network for training; return float32 logits."""
         try:
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
                 return self._forward(images).float()
         except torch._dynamo.exc.TorchDynamoException as error:
-            # A compiler on the path may still lack headers, and CUDA its Triton.
+            # Compilation may still fail without compiler headers, or on CUDA without Triton.
             if self.device_options.compile:
                 raise OptionError(
                     f"torch.compile does not work here ({first_line(error)}): set `compile=False`"
@@ -150,7 +150,7 @@ class DenseTrainer(Trainer):
         return torch.cuda.max_memory_allocated() if self.device.type == "cuda" else 0
 
     def describe(self) -> str:
-        """Say in words how the network is run."""
+        """Return a text that says how the network runs."""
         precision = "bfloat16" if self.bfloat16 else "float32"
         return f"{self.device.type}, {precision}, {'compiled' if self.compiled else 'eager'}"
 
@@ -187,7 +187,7 @@ class DenseTrainer(Trainer):
     def _pos_weight(self, images: Tensor) -> Tensor | None:
         """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
         normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
-        if dark is None or dark == normal:  # the images need not be looked at
+        if dark is None or dark == normal:  # the visibility of images does not matter
             return None if normal == 1 else self.to_device(torch.tensor([normal]))
         weights = {"normal": normal, "low": dark}
         each = [weights[visibility_of(luma(image))] for image in images.numpy()]
@@ -229,7 +229,7 @@ class DenseTrainer(Trainer):
 
 
 def freeze_batch_norm(network: nn.Module) -> None:
-    """Make the batch normalisations use the statistics they have, until `network.train()`."""
+    """Make batch normalisations use their current statistics, until `network.train()`."""
     for module in network.modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             module.eval()

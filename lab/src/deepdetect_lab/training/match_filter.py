@@ -42,56 +42,56 @@ from .trainer import Trainer, digests, seeded, with_plateau
 ONNX = "match_filter.onnx"
 
 WIDTH, ROUNDS = 32, 3
-"""Numbers that describe a match, and how often those around it change them. Both were set once."""
+"""Number of features of a match, and of rounds in which neighbours update them. Chosen by hand."""
 
 OF_A_MATCH, OF_TWO = 4, 11
-"""Numbers that the network begins with, for a match, and for one around another."""
+"""Numbers of input features of a match, and of a match relative to its neighbour."""
 
 RATIO_RANGE, RATIO_SCALE, RATIO_OFFSET = (0.05, 1.2), 3, 0.5
-"""The logarithm of a ratio, kept within this range, is scaled and shifted to a mean near 0 and a
-deviation near 1. Ratios above 1 are possible: the nearest keypoint is not always the mutual one."""
+"""Ratios are clipped to this range. Their logarithm is scaled and shifted to a mean near 0 and a
+standard deviation near 1. Mutual matches can have ratios above 1."""
 
 MEAN_COSINE = 0.7
-"""About the mean of the cosines of how far keypoints are turned, which is taken off."""
+"""Approximate mean cosine of the keypoints' rotation, which is subtracted from the feature."""
 
 LEAST_TRUST = 0.5
-"""It is added to the sum of the trusts, so that the mean around a match that nobody near is trusted
-for is near 0."""
+"""It is added to the sum of the neighbours' weights, so that their weighted mean is near 0 if all
+weights are near 0. Chosen by hand."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
-"""Side of the views in pixels; the most keypoints in each; and the fewest matches of a pair, one
-more than each is compared with."""
+"""Side of the views in pixels; largest number of keypoints of each; smallest number of matches of a
+pair, one more than the neighbours of a match."""
 
 UNRELATED = 7
-"""One pair in this many shows two photographs; odd, so that both descriptors have some."""
+"""Every 7th pair shows two unrelated photographs; 7 is odd, so that both descriptors get some."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
-"""Matches are right below the first distance from the truth and wrong above the second; what is
-between is neither, as places in the truth are known to a pixel or two."""
+"""Matches with an error below the first distance are correct, above the second wrong. Others are
+ignored, because the ground truth is only accurate to a pixel or two."""
 
 WARM_UP_STEPS, DECAY_SHARE = 50, 0.7
-"""The learning rate rises over these steps, and falls linearly to 0 over this share of all, the
-last."""
+"""The learning rate rises over these steps, and falls linearly to 0 over this last share of the
+steps. Chosen by hand."""
 
 WEIGHT_DECAY = 0.01
-"""The default of AdamW."""
+"""Weight decay, the default of AdamW."""
 
 LEFT_OUT_SHARE, FEWEST_SHARE = 0.5, 0.02
-"""Share of the pairs of which matches are left out, and the fewest that stay: down to 2 %, since
-pairs of few matches are what a filter is for."""
+"""Share of the pairs whose matches are randomly left out, and the smallest share of matches kept:
+2 %, since the filter is meant for pairs with few matches."""
 
 TURNED_SHARE = 0.3
-"""Share of the pairs that are turned as a whole, by any angle."""
+"""Share of the pairs that are rotated as a whole, by any angle. Chosen by hand."""
 
 VALIDATION_SEED = 1
-"""Seed of the pairs that weights are measured on, whatever the seed of the run."""
+"""Seed of the validation pairs, which does not depend on the seed of the run."""
 
 Sample = tuple[dict[str, np.ndarray], np.ndarray]
-"""What the network is given, and each match's distance from the truth in pixels."""
+"""Inputs of the network, and the error of each match in pixels."""
 
 
 class MatchFilter(nn.Module):
-    """Maps matches, each with those around it, to the logits of their being right."""
+    """A network from matches and their neighbours to the logits of being correct."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -116,7 +116,7 @@ class MatchFilter(nn.Module):
         ratios: Tensor,
         around: Tensor,
     ) -> Tensor:
-        """Map (M, 2) pixels, (M,) sizes, turns in radians and ratios, (M, 2 K) rows of others."""
+        """Map (M, 2) pixels, (M,) sizes, rotations (radians), ratios, (M, 2 K) neighbours' rows."""
         growth, cosine, sine = (sizes1 / sizes0).log(), turns.cos(), turns.sin()
         distinct = RATIO_SCALE * ratios.clamp(*RATIO_RANGE).log() + RATIO_OFFSET
         own = torch.stack([distinct, growth, cosine - MEAN_COSINE, sine], 1)
@@ -134,25 +134,25 @@ class MatchFilter(nn.Module):
     def _compare(
         self, xy0: Tensor, xy1: Tensor, growth: Tensor, cosine: Tensor, sine: Tensor, around: Tensor
     ) -> Tensor:
-        """Return (M, 2 K, 11): how those around lie to a match, in units of their distance."""
+        """Return (M, 2 K, 11): positions of neighbours relative to a match, in their distance."""
         there0, there1 = xy0[around] - xy0[:, None], xy1[around] - xy1[:, None]
         away0, away1 = (each.square().sum(2).sqrt() for each in (there0, there1))
         middle = AROUND // 2
         unit = (away0[:, middle] * away1[:, AROUND + middle]).sqrt()[:, None, None] + 1
-        # As the match's own size and angle would have it.
+        # Predicted from the size and angle of the match itself.
         (x, y), c, s = there0.unbind(2), cosine[:, None], sine[:, None]
         expected = torch.stack([c * x - s * y, s * x + c * y], 2) * growth.exp()[:, None, None]
         lengths = [there0, there1, 2 * (there1 - there0), 2 * (there1 - expected)]
         stretch = ((away1 + 1) / (away0 + 1)).log()
         growths = [stretch, growth[:, None] - stretch, growth[around] - growth[:, None]]
         scaled = torch.cat(lengths, 2) / unit
-        # The inverse hyperbolic sine, which the exporter does not know.
+        # Inverse hyperbolic sine, which the exporter lacks.
         scaled = scaled.sign() * (scaled.abs() + (scaled * scaled + 1).sqrt()).log()
         return torch.cat([scaled, torch.stack(growths, 2)], 2)
 
 
 def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
-    """Draw a pair of views, described and matched, by a seed and the number of the pair."""
+    """Draw, describe and match a pair of views; it depends on the seed and its number."""
     rng = np.random.default_rng([seed, number])
     detector = PointDetector(KEYPOINTS, descriptor=(LEARNED, ROOT_SIFT)[number % 2])
 
@@ -172,7 +172,7 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
         if number % UNRELATED:
             there, _, seen = correspond(layers, tops, xy0)
             errors[seen] = np.linalg.norm(there - xy1, axis=1)[seen]
-            # What is mirrored at the border of a photograph may match rightly, or not.
+            # Matches in areas mirrored at the photograph's border may be correct or wrong.
             row, column = np.rint(xy0).astype(int).clip(0, SIDE_PX - 1).T[::-1]
             for k, layer in enumerate(layers):
                 place = layer.views[0].to_photograph(xy0)
@@ -185,7 +185,7 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
 
 
 def draw_samples(files: Sequence[Path], seed: int, count: int, quiet: bool = True) -> list[Sample]:
-    """Draw pairs in all processors; each is a function of the seed and its number."""
+    """Draw pairs in parallel; each depends only on the seed and its number."""
     made = []
     with progress(count, "drawing pairs", "pair", quiet) as bar:
         for sample in map_in_processes(partial(draw_sample, files, seed), range(count)):
@@ -205,7 +205,7 @@ def mutual_matches(features0: Keypoints, features1: Keypoints) -> DescriptorMatc
 
 
 def vary(rng: np.random.Generator, sample: Sample) -> Sample:
-    """Leave out matches, and mirror, turn and swap the images of a pair."""
+    """Randomly leave out matches, and mirror, rotate and swap the images of a pair."""
     values, errors = sample
     values = {name: each for name, each in values.items() if name != "around"}
     if rng.random() < LEFT_OUT_SHARE:
@@ -229,7 +229,7 @@ def vary(rng: np.random.Generator, sample: Sample) -> Sample:
 
 
 def join(samples: Sequence[Sample]) -> tuple[list[Tensor], Tensor]:
-    """Make one of several pairs, whose matches are around none of another pair."""
+    """Concatenate several pairs; matches of different pairs are never neighbours."""
     starts = np.cumsum([0, *(len(errors) for _, errors in samples[:-1])])
     moved = [
         {**values, "around": values["around"] + start}
@@ -240,12 +240,12 @@ def join(samples: Sequence[Sample]) -> tuple[list[Tensor], Tensor]:
 
 
 def known(errors: Tensor) -> Tensor:
-    """Return which matches are right or wrong, by their distances from the truth."""
+    """Return which matches are clearly correct or wrong, by their errors."""
     return (errors < RIGHT_PX) | (errors > WRONG_PX)
 
 
 class BatchDataset(Dataset[tuple[list[Tensor], Tensor]]):
-    """Batches by step: pairs out of all, varied anew; a function of the seed and the step."""
+    """Batches by step: randomly varied pairs, which depend on the seed and the step."""
 
     def __init__(self, samples: Sequence[Sample], options: MatchFilterTrainingOptions) -> None:
         self.samples, self.options = samples, options
@@ -257,7 +257,7 @@ class BatchDataset(Dataset[tuple[list[Tensor], Tensor]]):
 
 
 class MatchFilterTrainer(Trainer):
-    """The match filter, and the images whose views it is trained on."""
+    """Training of the match filter on views of images."""
 
     objective, sign = "validation_loss", 1
     purpose = "that separates correct matches from wrong ones"
@@ -319,7 +319,7 @@ class MatchFilterTrainer(Trainer):
 
 
 RATIOS = {LEARNED: LEARNED_RATIO, ROOT_SIFT: RATIO}
-"""The ratio test that each kind of descriptors is compared with."""
+"""Ratio test with which the filter is compared, by kind of descriptor."""
 
 WAYS = ("ratio test", "filter", "filter, as precise")
 MEASURES = ("right", "precision", "of unrelated views")
@@ -327,7 +327,7 @@ MEASURES = ("right", "precision", "of unrelated views")
 
 @torch.no_grad()
 def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]:
-    """Return the loss, and compare the ratio test, the filter, and the filter made as precise."""
+    """Return the loss, and measures of ratio test, filter, and filter at equal precision."""
     found, losses = {}, []
     for offset, (name, limit) in enumerate(RATIOS.items()):
         own = samples[offset::2]
@@ -359,7 +359,7 @@ def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]
 
 
 def export_match_filter(network: MatchFilter, sample: Sample, path: Path) -> None:
-    """Write the network as `filter_matches` reads it."""
+    """Write the network as an ONNX file, which `filter_matches` reads."""
     inputs = {name: torch.from_numpy(each) for name, each in sample[0].items()}
     axes = {name: {0: "matches"} for name in (*inputs, "logits")}
     with atomic_path(path) as temporary:

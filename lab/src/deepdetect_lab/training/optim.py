@@ -10,28 +10,28 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 BETA = 0.95
-"""Decay of all three means of `Soap`, as in its paper."""
+"""Decay of the three running means of `Soap`, as in its paper."""
 
 EPS = 1e-8
 PRECONDITION_FREQUENCY = 10
-"""Steps from one update of the basis to the next."""
+"""Number of steps between updates of the basis."""
 
 NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)
-"""Coefficients of the polynomial that brings singular values near 1 (Keller Jordan, "Muon")."""
+"""Coefficients of the polynomial that maps singular values to near 1 (Keller Jordan, "Muon")."""
 
 NEWTON_SCHULZ_STEPS = 5
 MUON_RMS = 0.2
-"""Root mean square of a step's changes in learning rates, about that of Adam (arXiv:2502.16982)."""
+"""Root mean square of a step in units of the learning rate, as for Adam (arXiv:2502.16982)."""
 
 MUON_WEIGHT_DECAY = 0.01
 INITIAL_POWER_ITERATIONS = 3
-"""Steps of the power iteration from the axes to the first eigenbasis."""
+"""Number of power iterations for the first eigenbasis, which start from the axes."""
 
 
 def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
     """Make the optimisers that together train a network's parameters.
 
-    They are "adam", or "soap": SOAP for the kernels, Adam for biases and the like.
+    "adam" uses Adam; "soap" uses SOAP for kernels, and Adam for biases and other vectors.
     """
     if name == "adam":
         return [torch.optim.Adam(network.parameters(), fused=True)]
@@ -41,10 +41,10 @@ def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
 
 
 class KernelOptimizer(Optimizer):
-    """An optimiser of matrices and convolution kernels: matrices with one row per output channel.
+    """An optimiser of matrices and of kernels, seen as matrices with one row per output channel.
 
-    All of the state are tensors, per parameter, so that safetensors can store them and a run
-    resumes bit by bit.
+    The whole state consists of tensors per parameter, so that safetensors can store it and a
+    resumed run is bit-identical.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 1e-3) -> None:
@@ -66,8 +66,8 @@ class KernelOptimizer(Optimizer):
 class Soap(KernelOptimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 
-    pytorch-optimizer's keeps one basis for each axis of a kernel, in lists, beside numbers. The
-    first step only computes the first basis.
+    The first step only computes the first basis. pytorch-optimizer's version is not used, because
+    its state holds lists and numbers, with a basis for each axis of a kernel.
     """
 
     def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
@@ -75,7 +75,7 @@ class Soap(KernelOptimizer):
         if not state:
             state.update(_initial_state(gradient))
             return
-        state["step"] = state["step"].cpu() + 1  # a checkpoint restores it on the GPU
+        state["step"] = state["step"].cpu() + 1  # restored on the GPU by a checkpoint
         left, right = state["left_basis"], state["right_basis"]
         mean, square = state["exp_avg"], state["exp_avg_sq"]
         mean.lerp_(gradient, 1 - BETA)
@@ -93,7 +93,7 @@ class Soap(KernelOptimizer):
 
 
 def _update_basis(state: dict[str, Tensor], side: str, axis: int) -> None:
-    """Follow the eigenvectors of one side by a step of the power iteration."""
+    """Update the eigenvectors of one side by a power iteration."""
     matrix, basis = state[side], state[f"{side}_basis"]
     order = (basis.T @ matrix @ basis).diagonal().argsort(descending=True)
     state["exp_avg_sq"].copy_(state["exp_avg_sq"].index_select(axis, order))
@@ -113,13 +113,13 @@ def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
         basis = torch.eye(len(state[side]), device=gradient.device)
         for _ in range(INITIAL_POWER_ITERATIONS):
             basis = torch.linalg.qr(state[side] @ basis)[0]
-        # Stored by rows, as a checkpoint restores it: rounding depends on the layout.
+        # Contiguous, as restored from a checkpoint, because rounding depends on the layout.
         state[f"{side}_basis"] = basis.contiguous()
     return state
 
 
 class Muon(KernelOptimizer):
-    """Muon (Keller Jordan, 2024): momentum whose matrix is made orthogonal before each step."""
+    """Muon (Keller Jordan, 2024): momentum, orthogonalised as a matrix before each step."""
 
     def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
         mean = self.state[parameter].setdefault("mean", torch.zeros_like(gradient))

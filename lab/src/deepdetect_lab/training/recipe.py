@@ -1,4 +1,4 @@
-"""Training recipes, the options that decide which weights come out; presets; device options."""
+"""Training recipes, their presets, and device options."""
 
 from __future__ import annotations
 
@@ -24,9 +24,8 @@ class Stage:
     Attributes:
         crop: side of the square crops in pixels, a multiple of 8.
         batch: crops per batch.
-        epochs: how often each image is seen.
-        sides: shorter sides of the views that crops are taken from; default: all that are
-            large enough.
+        epochs: number of times that each image is used.
+        sides: shorter sides of the views to crop; default: all that are large enough.
     """
 
     crop: int
@@ -58,8 +57,8 @@ class Stage:
             chosen = tuple(int(part) for part in sides.split(",")) if at else ()
         except ValueError:
             raise OptionError(
-                f"a stage is written CROPxBATCHxEPOCHS, as 240x16x40, or 240x16x40@360 for views "
-                f"of one size, not {text!r}"
+                f"a stage has the form CROPxBATCHxEPOCHS, such as 240x16x40, or 240x16x40@360 for "
+                f"views of one size, not {text!r}"
             ) from None
         return cls(crop, batch, epochs, chosen)
 
@@ -67,47 +66,43 @@ class Stage:
 @suggest_keywords
 @dataclass(frozen=True)
 class TrainingOptions:
-    """Everything that decides which weights come out, given the images.
+    """Options of a training that change the resulting weights.
 
     Attributes:
-        network: name of the network that is trained: "fast" or "espnet".
-        stages: stages of the training, one after the other. Crops as large as the view show all
-            that its label depends on (Harris and Sobel labels are relative to the image's largest
-            response), which the global term of `fast` needs; smaller ones give many cheap steps.
-        interleave: go through all stages at the same time, their steps evenly mixed, so that
-            every size is seen until the end.
-        short_sides: sizes in pixels that the shorter side of the images is scaled to. Crops are
-            taken from those that are large enough. The first is that of the validation.
-        square: make the images squares: "crop" cuts the middle out, "squash" squashes them, as the
-            paper does. None: they keep their shape.
+        network: name of the network: "fast" or "espnet".
+        stages: stages of the training in order. Crops of whole views show everything on which the
+            label depends, because Harris and Sobel labels are relative to the image's largest
+            response; the global term of `fast` needs them. Smaller crops make steps cheaper.
+        interleave: mix the steps of all stages evenly, so that every size is used until the end.
+        short_sides: sizes in pixels to which the shorter side of images is scaled. Crops are taken
+            from all views that are large enough. The first size is used for validation.
+        square: make images square: "crop" takes the central square, "squash" resizes without
+            keeping the aspect ratio, as in the paper. None: keep the shape.
         max_images: use at most this many images, including those for validation.
-        val_fraction: fraction of the images held out for validation, when no folder is given.
+        val_fraction: fraction of the images held out for validation if no folder is given.
         dark_fraction: fraction of darkened crops (paper: a quarter).
-        augmentations: augmented views of each image at the first size, in normal and in dark
-            light: rotated, relit, blurred, noisy or compressed. Each is used as often as the plain
-            view of a size.
-        transpositions: mirror crops along their diagonal, which changes labels of BRISK only;
-            flips also change those of Shi-Tomasi, SIFT and ORB.
-        color_jitter: fraction of the crops whose colours are removed, or rotated with the same
-            luma to a grey level, the only thing that labels and `fast` depend on.
-        optimizer: "adam", or "soap", which learns more per image (lab/HISTORY.md has the
-            measurements).
+        augmentations: number of augmented views of each image at the first size, for normal and for
+            dark light: rotated, relit, blurred, noisy or compressed. Each is used as often as the
+            original view of a size.
+        transpositions: mirror crops along their diagonal, which only changes labels of BRISK; flips
+            would also change those of Shi-Tomasi, SIFT and ORB.
+        color_jitter: fraction of the crops whose colours are removed or rotated. The luma, on which
+            labels and `fast` depend, changes by at most one grey level.
+        optimizer: "adam", or "soap", which learns more per image (measurements: lab/HISTORY.md).
         learning_rate: learning rate at the start of the cosine annealing to 1e-6.
-        warm_up: fraction of the steps over which the learning rate rises from zero. A run that
-            starts from trained weights needs it: the first steps of Adam, whose moments are not
-            known yet, would undo much.
-        average_decay: decay, in each step, of the exponential average of the weights, which is what
-            is validated and saved; 0: the weights themselves are.
+        warm_up: fraction of the steps over which the learning rate rises from zero. Trained initial
+            weights need it, because the first steps of Adam have poor moments and would undo much.
+        average_decay: decay per step of the exponential average of the weights, which is validated
+            and saved; 0 takes the weights themselves.
         max_gradient_norm: gradients with a larger norm are scaled down to it; None: no limit.
-        frozen_batch_norm: normalise by the batch statistics of the initial weights, as the
-            finished network does, not by those of each batch, which vary much between batches of a
-            few images. None: if the initial weights are trained ones.
-        pos_weight: weight of marked pixels in the loss. With 1 the network marks too little
-            where it is uncertain, since most pixels are not marked; above 1 it finds more
-            keypoints at a probability of 0.5.
+        frozen_batch_norm: normalise by the batch statistics of the initial weights, because those
+            of small batches vary much. None: only if the initial weights are trained.
+        pos_weight: weight of marked pixels in the loss. With 1 the network marks too few pixels
+            where it is uncertain, since most pixels are not marked. Above 1 it finds more keypoints
+            at a probability of 0.5.
         low_light_pos_weight: weight of marked pixels in crops of low visibility. None: the same.
         labels: the label detectors and their settings.
-        val_count: number of times that the validation loss is computed.
+        val_count: number of validations.
         seed: seed of the initial weights, the order of the images, the crops and their
             augmentation.
 
@@ -184,7 +179,7 @@ class TrainingOptions:
 @suggest_keywords
 @dataclass(frozen=True)
 class DeviceOptions:
-    """How the network is run, which does not change the recipe.
+    """How the network runs, which does not change the recipe.
 
     Attributes:
         device: "auto" (CUDA if there is a GPU, else the CPU), "cpu" or "cuda".
@@ -192,9 +187,8 @@ class DeviceOptions:
             computes with it.
         compile: use torch.compile; by default if there is a C++ compiler.
         threads: CPU threads of torch; by default torch's choice.
-        num_workers: processes that load and augment crops (of a torch DataLoader), 0 for none
-            but the one that trains; by default 0 when training on a CPU, which has no time to
-            spare, and one per processor but one when training on a GPU.
+        num_workers: number of processes that load and augment crops; 0: the training process does.
+            Default: 0 on a CPU; on a GPU one less than the number of processors.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -228,7 +222,7 @@ class DeviceOptions:
 @suggest_keywords
 @dataclass(frozen=True)
 class PointsTrainingOptions:
-    """A training of the ranker of points.
+    """Options of a training of the keypoint ranker.
 
     Attributes:
         steps: optimiser steps.
@@ -236,8 +230,8 @@ class PointsTrainingOptions:
         side: side of the square views, in pixels.
         learning_rate: highest learning rate; cosine annealing to 2 % of it.
         min_density, max_density: range of the budgets in keypoints per pixel, log-uniform.
-        val_count: how many times the weights are measured after the start.
-        val_pairs: pairs of each kind that they are measured on: zoom, blur, viewpoint, light.
+        val_count: number of validations after the start.
+        val_pairs: number of validation pairs of each kind: zoom, blur, viewpoint, light.
         seed: seed of the weights and the pairs.
 
     Raises:
@@ -269,16 +263,16 @@ class PointsTrainingOptions:
 @suggest_keywords
 @dataclass(frozen=True)
 class DescriptorTrainingOptions:
-    """A training of the learned descriptor.
+    """Options of a training of the learned descriptor.
 
     Attributes:
         steps: optimiser steps.
         pairs: pairs of views in each step.
         learning_rate: highest learning rate (of Muon), after the warm-up; it falls linearly to 0.
-        val_count: number of times that the weights are measured.
-        val_pairs: pairs of each kind that they are measured on: upright, turned, zoomed.
-        cross_modal: make the views of a pair look like those of different sensors: with other
-            mixtures of colours, inverted or any other tones, or edges.
+        val_count: number of validations.
+        val_pairs: number of validation pairs of each kind: upright, rotated, zoomed.
+        cross_modal: simulate different sensors for the views of a pair: other mixtures of colour
+            channels, inverted or otherwise changed tones, or edges.
         seed: seed of the weights and the pairs.
 
     Raises:
@@ -306,14 +300,14 @@ class DescriptorTrainingOptions:
 @suggest_keywords
 @dataclass(frozen=True)
 class MatchFilterTrainingOptions:
-    """A training of the match filter.
+    """Options of a training of the match filter.
 
     Attributes:
         steps: optimiser steps.
-        pairs: pairs of views in each step, each varied anew.
-        drawn: pairs of views that are drawn before the first step, to be taken from.
+        pairs: pairs of views in each step, varied at random.
+        drawn: number of pairs of views drawn before the first step, from which steps choose.
         learning_rate: highest learning rate, after the warm-up; it falls linearly to 0.
-        val_count: number of times that the weights are measured.
+        val_count: number of validations.
         val_pairs: pairs that the weights are measured on.
         seed: seed of the weights and the pairs.
 
@@ -356,9 +350,9 @@ _ESPNET = TrainingOptions(
 )
 
 PRESETS: dict[str, TrainingOptions] = {
-    # Whole views of several sizes and lights, the average of the weights.
+    # Whole views of several sizes, in normal and dark light; the average of the weights.
     "default": TrainingOptions(),
-    # Small crops first, evenly scaled images of several sizes.
+    # Small crops first; images of several sizes keep their aspect ratio.
     "espnet": _ESPNET,
     # The paper's (Section III-B): about 33,000 images to train on and 8,000 for validation,
     # squashed to 480x480, a quarter darkened, 100 epochs in batches of 64.

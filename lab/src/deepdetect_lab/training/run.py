@@ -1,6 +1,6 @@
-"""The trainings, and `profile`: how fast a run would be.
+"""Train networks, and `profile` the speed of a run.
 
-Torch is imported by a run, not with this module: commands that do not train start without it.
+Torch is imported by a run, not with this module, because other commands start faster without it.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ def train(
 ) -> TrainingResult:
     """Train the network on a folder of images.
 
-    A run that was interrupted resumes from its last checkpoint when it is started again
-    with the same options, with the same result as an uninterrupted one. Labels are made in
-    other processes, so a script must call this under `if __name__ == "__main__":`.
+    An interrupted run resumes from its last checkpoint if started again with the same options; the
+    result is the same as without interruption. Labels are made in other processes, so a script must
+    call this under `if __name__ == "__main__":`.
 
     Args:
         images: folder of images, or of shards (`write_shards`).
@@ -58,11 +58,11 @@ def train(
         options: the recipe.
         validation: folder of other images. None: some of the images are held out.
         labels: folder of the label cache. None: in `output`.
-        init_weights: weights (.safetensors) to start from, or "default", "dense", "free" or
-            "espnet" inside the package; of several, their mean. None: random ones, by the seed.
-        device: how the network is run.
+        init_weights: weights to start from, .safetensors files or the bundled "default", "dense",
+            "free" or "espnet"; several are averaged. None: random weights by the seed.
+        device: how the network runs.
         workers: processes that make labels. None: one per processor.
-        log: takes lines of text for the user; without it there is no progress bar either.
+        log: function for lines of text for the user; None also turns off progress bars.
 
     Returns:
         The weights' files and the loss curves.
@@ -70,7 +70,7 @@ def train(
     Raises:
         ImageError: a folder is missing or empty.
         OptionError: the folder holds a run with other options, the initial weights are of another
-            network, or the batch statistics of random weights are to be frozen.
+            network, or `frozen_batch_norm` is set without trained initial weights.
         WeightsError: the initial weights are missing or do not fit.
         DeepDetectError: an image cannot be read.
 
@@ -97,24 +97,24 @@ def train_on_pairs(
     num_workers: int | None = None,
     log: Log | None = None,
 ) -> TrainingResult:
-    """Train on pairs of views that are made of single images; the options say what.
+    """Train on pairs of synthetic views generated from single images.
 
-    It is the ranker of points, the learned descriptor, or the match filter, which takes a quarter
-    of an hour on two processors. An interrupted run resumes as one of `train` does.
+    The options choose the network: keypoint ranker, learned descriptor, or match filter (a quarter
+    of an hour on two processors). An interrupted run resumes as in `train`.
 
     Args:
-        images: folder of images, best of some 480 pixels a side.
-        validation: folder of other images, which choose the best weights.
+        images: folder of images, ideally with sides of about 480 pixels.
+        validation: folder of other images, by which the best weights are chosen.
         output: folder for checkpoint.safetensors, the best weights (of the ranker best.npz, else
             safetensors and ONNX), MODEL_CARD.md and the curves.
         options: the recipe.
-        init_weights: weights (descriptor.safetensors) that a descriptor starts from. None: random
-            ones, by the seed.
-        device: "auto" is CUDA if there is a GPU, else the CPU. Only a descriptor is trained on one.
-        num_workers: processes that make the pairs; 0: the training process does. None: 0 on a CPU,
-            one per processor but one beside a GPU. A match filter draws its pairs before, by all
-            processors.
-        log: takes lines of text for the user; without it there is no progress bar either.
+        init_weights: initial weights of a descriptor (descriptor.safetensors). None: random by the
+            seed.
+        device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
+        num_workers: processes that generate pairs; 0: the training process does. None: 0 on a CPU;
+            with a GPU one less than the number of processors. A match filter draws its pairs
+            before training, on all processors.
+        log: function for lines of text for the user; None also turns off progress bars.
 
     Returns:
         The weights' files, of which `PointDetector` takes those of ranker and descriptor.
@@ -152,7 +152,7 @@ def train_on_pairs(
 def _files(
     images: str | Path, validation: str | Path, output: str | Path
 ) -> tuple[list[Path], list[Path]]:
-    """List the images to train on, and others to choose weights by, without pictures of the run."""
+    """List training and validation images, without figures that the run writes."""
     images, validation, output = Path(images), Path(validation), Path(output)
     return find_images(images, [output, validation]), find_images(validation, [output, images])
 
@@ -166,19 +166,21 @@ def _dense_trainer(
     log: Log | None = None,
     **data: Any,
 ) -> DenseTrainer:
-    """Make the labels, and what is trained on them; `data` are further arguments of `train`."""
+    """Make the labels and the trainer; `data` are further arguments of `train`."""
     from .dataset import prepare_data
     from .dense import DenseTrainer, initial_network
 
-    options, network = initial_network(options, init_weights)  # before the labels, for its errors
+    options, network = initial_network(
+        options, init_weights
+    )  # raises its errors before labels are made
     loading = max(1, device.worker_count)
     prepared = prepare_data(images, options, output, **data, processes=loading, quiet=log is None)
     return DenseTrainer(network, options, prepared, device)
 
 
 TIMED_STEPS, WARM_UP_STEPS = 30, 5
-"""Steps of each stage that `profile` times, and those before them, which compile, allocate memory
-and render the first views."""
+"""Number of steps of each stage that `profile` times, and of steps before them, in which networks
+are compiled, memory is allocated and first views are rendered."""
 
 
 def profile(
@@ -189,17 +191,16 @@ def profile(
     log: Log | None = None,
     **how: Any,
 ) -> list[dict[str, Any]]:
-    """Time some steps of each stage of a run of `train`; only the label cache is written.
+    """Time some steps of each stage of a `train` run; only the label cache is written.
 
-    Returns the speed of each stage, in crops and in 480x480 images' worth of pixels; the fraction
-    of the time in which the training waited for data; and the peaks of memory so far, 0 where
-    unknown.
+    Returns for each stage the crops per second, the same in units of 480x480 images, the fraction
+    of the time spent waiting for data, and the peak memory so far (0 if unknown).
     """
     from ..evaluation.profiling import peak_memory
     from .dataset import loading
     from .trainer import FULL_IMAGE_PIXELS
 
-    options = dataclasses.replace(options, interleave=False)  # each stage by itself
+    options = dataclasses.replace(options, interleave=False)  # stages are timed separately
     trainer = _dense_trainer(images, output, options, log=log, **how)
     if log is not None:
         log(f"timing {trainer.describe()}")

@@ -1,6 +1,6 @@
-"""The steps of a run, and their batches: pure functions of the seed and the step.
+"""The steps of a run and their batches, which depend only on the seed and the step.
 
-So an interrupted run resumes with exactly the batches it would have seen.
+So a resumed run gets exactly the batches of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SHUFFLED_SHARDS = 4
 
 
 class CropIndex(NamedTuple):
-    """An image's number, the epoch and the image's position in its order, and the stage."""
+    """Number of an image, epoch, position of the image in the epoch, and stage."""
 
     image: int
     epoch: int
@@ -32,7 +32,7 @@ class CropIndex(NamedTuple):
 
 
 class Position(NamedTuple):
-    """Where a step lies: its stage, its first crop in the stage, and the stage's first epoch."""
+    """Position of a step: its stage, its first crop in the stage, and the stage's first epoch."""
 
     stage: Stage
     sample: int
@@ -40,7 +40,7 @@ class Position(NamedTuple):
 
 
 class Schedule:
-    """The steps of a run by a recipe over a number of images."""
+    """The steps of a run with a recipe and a number of images."""
 
     def __init__(self, options: TrainingOptions, images: int) -> None:
         self.options = options
@@ -60,7 +60,7 @@ class Schedule:
         self._crops = np.concatenate([[0], np.cumsum(batches[self._stages])])
 
     def position(self, step: int) -> Position:
-        """Find the stage of a step, and its place in it."""
+        """Find the stage of a step and its position in the stage."""
         number = int(self._stages[step])
         stage = self.options.stages[number]
         first_epoch = sum(each.epochs for each in self.options.stages[:number])
@@ -74,12 +74,12 @@ class Schedule:
         return rate * min(1.0, (step + 1) / (options.warm_up * self.steps + 1))
 
     def crops_until(self, step: int) -> int:
-        """Return how many crops the steps before this one have."""
+        """Return the number of crops in all earlier steps."""
         return int(self._crops[step])
 
 
 def milestones(steps: int, count: int) -> set[int]:
-    """Return the numbers of steps done at `count` evenly spaced points, the end among them."""
+    """Return the numbers of steps at `count` evenly spaced points, including the end."""
     return {round(steps * part / count) for part in range(1, count + 1)} - {0}
 
 

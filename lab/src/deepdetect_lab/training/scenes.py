@@ -1,9 +1,9 @@
-"""Synthetic scenes: layers of photographs in two views, and where these show the same places.
+"""Synthetic scenes: layers of photographs in two views, with known correspondences.
 
-Both views are warped (zoom, rotation, tilt, perspective), the second also by a smooth relief; parts
-of other photographs may lie in front, each of which moves a little on its own. So depth and
-occlusion are seen without any pair of real photographs. The learned descriptor and the match filter
-are trained on them.
+Both views are warped (zoom, rotation, tilt, perspective), the second also by a smooth relief. Parts
+of other photographs may be in front, each with a small motion of its own. So networks learn depth
+and occlusion without pairs of real photographs. Learned descriptor and match filter are trained on
+them.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from .synthetic import (
 Drawn = TypeVar("Drawn")
 
 SIDE_PX = 256
-"""Side of the square views, unless they are drawn larger: perspectives are given for this one."""
+"""Default side of the square views, for which perspectives are given. Chosen by hand."""
 
 MARGIN_PX = 6
-"""What lies this near to the border of a view is not used: its surroundings are not seen."""
+"""Keypoints this near to the border of a view are not used, because their context is cut off."""
 
 OFFSET_PX = 90.0
-"""The middle of the first view is up to 90 pixels from that of the photograph, along each axis:
-with 480 pixels a side, all parts of it are seen now and then."""
+"""The centre of the first view is up to 90 pixels from that of the photograph along each axis, so
+that photographs of 480 pixels are sometimes seen in every part."""
 
 SCALE = Effect(1, math.log(0.6), math.log(1.5))
-"""Logarithm of the pixels of the photograph to one of the first view."""
+"""Log scale of the first view, in pixels of the photograph per pixel. Chosen by hand."""
 
 SCALE_LIMITS = (0.42, 1.8)
-"""Both views keep to these pixels of the photograph to one of theirs where the zoom allows: larger
-views are blurred, smaller ones show mostly what is mirrored at the photograph's border."""
+"""Scales of both views, in pixels of the photograph per pixel, are kept in this range if the zoom
+allows: enlarged views would be blurred, reduced ones would mostly show mirrored borders."""
 
 ZOOMS = (Effect(1, -0.2, 0.2), Effect(0.5, -math.log(2.1), math.log(2.1)))
 FAR_ZOOM = Effect(0.18, math.log(1.8), math.log(4.2))
-"""Logarithm of the zoom from the first view to the second; the last that happens is taken, the far
-one in or out. An earlier descriptor, trained on less zoom, lost on zoomed images."""
+"""Log zoom from the first to the second view. The last effect that is drawn counts; the far zoom
+goes in or out. An earlier descriptor, trained on less zoom, was worse on zoomed images."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
-"""Shares of first views, and of second views relative to these, that are rotated by any angle; the
-standard deviations of the others in radians, about 8 degrees, as hand-held cameras have."""
+"""Shares of first views, and of second relative to first views, that are rotated by any angle. The
+others have these standard deviations in radians, about 8 degrees, like hand-held cameras."""
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
 """Tilt is the ratio of the scales along two axes. For this share of second views its logarithm is
@@ -65,17 +65,17 @@ normal with this deviation; for the others it is even, up to a tilt of 2.5, a pl
 degrees, beyond which little of it can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
-"""The most by which tilts of first views exceed 1: of the scene, and of the parts in front."""
+"""Tilts of first views exceed 1 by at most these values, for the scene and for parts in front."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
 """Standard deviation of both coefficients of the perspective, per pixel of a view of `SIDE_PX`: the
 scale changes by 11 % from the middle to a border. First views have half of it."""
 
 SHIFT_DEVIATION = 18.0
-"""Standard deviation of the shift of the second view in pixels of the first one."""
+"""Standard deviation of the second view's shift, in pixels of the first. Chosen by hand."""
 
 RELIEF_SHARE, RELIEF_PX = 0.45, (1.5, 5.0)
-"""Share of the second views with a relief, and one standard deviation of its height in pixels."""
+"""Share of second views with a relief, and range of its height's standard deviation in pixels."""
 
 SMOOTH_CELLS = (3, 8)
 """Relief and shapes have 3 to 7 random values along a side: with more, a relief could not be
@@ -109,29 +109,28 @@ STEP_PX = 2.0
 """Derivatives are differences over this step to both sides: more than what is rounded."""
 
 ATTEMPTS = 200
-"""Scenes are drawn so many times: of photographs that then still show too little none has
-detail."""
+"""Scenes are redrawn this often; photographs that then still share too little have no detail."""
 
 ITERATIONS = 5
-"""Steps of the fixed point that inverts a relief: five leave 0.01 pixels at 99 % of all places,
-half a pixel at the worst one."""
+"""Fixed-point iterations to invert a relief: after five, the error is below 0.01 pixels at 99 % of
+all places and 0.5 pixels at the worst."""
 
 
 @dataclass(frozen=True)
 class View:
-    """Where a view shows a photograph: a homography of its pixels moved by a relief (S, S, 2)."""
+    """Map from a view to a photograph: a (S, S, 2) displacement by a relief, then a homography."""
 
     matrix: np.ndarray
     relief: np.ndarray | None = None
     side_px: int = SIDE_PX
 
     def to_photograph(self, xy: np.ndarray) -> np.ndarray:
-        """Map (N, 2) or (H, W, 2) positions of the view."""
+        """Map (N, 2) or (H, W, 2) positions of the view to the photograph."""
         mapped = transform_points(xy + self._moved(xy), self.matrix)
         return mapped.astype(np.float32).reshape(xy.shape)
 
     def from_photograph(self, xy: np.ndarray) -> np.ndarray:
-        """Map (N, 2) positions of the photograph, by iteration where there is a relief."""
+        """Map (N, 2) positions of the photograph to the view, iteratively if there is a relief."""
         flat = result = transform_points(xy, np.linalg.inv(self.matrix)).astype(np.float32)
         for _ in range(ITERATIONS if self.relief is not None else 0):
             result = flat - self._moved(result)
@@ -160,7 +159,7 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a view is taken from: the middle in the photograph, scale, angle and tilt."""
+    """Pose of a view: its centre in the photograph, scale, angle and tilt."""
 
     middle: np.ndarray
     scale: float
@@ -205,7 +204,7 @@ def draw_layers(
 
 
 def draw_until_seen(draw: Callable[[], Drawn | None]) -> Drawn:
-    """Draw until something is found; an OptionError where the photographs show too little."""
+    """Draw until a draw succeeds; raise an OptionError if the photographs show too little."""
     for _ in range(ATTEMPTS):
         if (drawn := draw()) is not None:
             return drawn
@@ -217,7 +216,7 @@ def _draw_photograph(rng: np.random.Generator, files: Sequence[Path]) -> np.ndar
 
 
 def _draw_scales(rng: np.random.Generator) -> list[float]:
-    """Draw the pixels of the photograph to one of each view."""
+    """Draw the scale of each view, in pixels of the photograph per pixel."""
     scale, zoom = math.exp(SCALE.strength(rng)), 1.0
     for effect in ZOOMS:
         if effect.happens(rng):
@@ -231,7 +230,7 @@ def _draw_scales(rng: np.random.Generator) -> list[float]:
 
 
 def _draw_relief(rng: np.random.Generator, side_px: int) -> np.ndarray:
-    """Draw by how many pixels each place of a view is moved, all in one direction."""
+    """Draw the displacement in pixels of each place of a view, all in one direction."""
     azimuth = rng.uniform(0, 2 * math.pi)
     height = smooth_noise(rng, side_px, SMOOTH_CELLS) * rng.uniform(*RELIEF_PX)
     moved = np.stack([height * math.cos(azimuth), height * math.sin(azimuth)], -1)
@@ -241,7 +240,7 @@ def _draw_relief(rng: np.random.Generator, side_px: int) -> np.ndarray:
 def _draw_front(
     rng: np.random.Generator, files: Sequence[Path], scene: Layer, poses: tuple[Pose, Pose]
 ) -> Layer:
-    """Draw a part in front of a scene: it moves as what is behind it does, and a little more."""
+    """Draw a part in front of a scene; it moves with the scene, plus a small motion of its own."""
     first, second = poses
     side_px = scene.views[0].side_px
     other = happens(rng, OTHER_PHOTOGRAPH_SHARE)

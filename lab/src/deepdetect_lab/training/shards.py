@@ -1,7 +1,7 @@
-"""Images with their labels in shards, for sets much larger than the memory or on slow disks.
+"""Store images and labels in shards, for data sets larger than memory or on slow disks.
 
-A shard is an uncompressed tar file in the layout of WebDataset: of every image the file, its name,
-and the labels of its views. The sampler reads a few shards at a time.
+A shard is an uncompressed tar file in the layout of WebDataset. For every image it has the file,
+its name, and the labels of its views. The sampler reads a few shards at a time.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Files = tuple[tuple[Path, int], ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """A folder of shards: files with the number of their images; names hold a content digest."""
+    """A folder of shards: files and their numbers of images; file names hold a content digest."""
 
     folder: Path
     training: Files
@@ -76,7 +76,7 @@ class Shards:
 
 
 class ShardSource:
-    """Images in shards, whose views the recipe decides."""
+    """Images in shards; the recipe determines their views."""
 
     def __init__(self, files: Files, options: TrainingOptions) -> None:
         self.files, self.options = files, options
@@ -87,7 +87,7 @@ class ShardSource:
         return self.ends[-1] if self.ends else 0
 
     def __getitem__(self, index: int) -> SourceImage:
-        """Return an image, whose path is its name in the folder it came from."""
+        """Return an image; its path is the name in the original folder."""
         shard, key, sample = self._sample(index)
         name = _read(shard, sample["name.txt"]).decode()
         return SourceImage(Path(name), key.rpartition("_")[2], *views_of(name, self.options))
@@ -106,7 +106,7 @@ class ShardSource:
         return image, mask
 
     def _sample(self, index: int) -> tuple[Path, str, Mapping[str, tuple[int, int]]]:
-        """Return the shard of an image, its key, and the places of its files."""
+        """Return the shard of an image, its key, and offset and size of its files."""
         number = bisect.bisect_right(self.ends, index)
         path, count = self.files[number]
         samples = _read_members(path)
@@ -128,14 +128,14 @@ def write_shards(
 ) -> Shards:
     """Write images with their labels into shards, in parallel over processes.
 
-    Shards that exist already with the same content stay: an interrupted call resumes, and when
-    some images have changed, only their shards are written again.
+    Existing shards with the same content are kept, so an interrupted call resumes, and only shards
+    of changed images are written again.
 
     Args:
         images: folder of images.
         output: another folder, for the shards.
-        options: the recipe of the runs to come; it decides which images are for validation.
-        shard_size: about this many images go into a shard.
+        options: the recipe of later runs, which determines the validation images.
+        shard_size: approximate number of images per shard.
         workers: number of processes; default one per processor.
         quiet: show no progress bar.
 
@@ -196,13 +196,13 @@ def write_shards(
 
 
 ShardTask = tuple[Path, Sequence[tuple[str, SourceImage, Sequence[View]]]]
-"""A shard to be written: its path, and the name of each image, the image, its views."""
+"""A shard to write: its path, and name, image and views of each image."""
 
 
 def _deal(
     images: Sequence[SourceImage], root: Path, shard_size: int
 ) -> list[list[tuple[str, SourceImage]]]:
-    """Deal images by the checksums of their names: most shards stay when an image is added."""
+    """Assign images to shards by checksums of names, so new images change few shards."""
     shards: list[list[tuple[str, SourceImage]]] = [[] for _ in range(-(-len(images) // shard_size))]
     for image in images:
         name = image.path.relative_to(root).as_posix()
@@ -223,7 +223,7 @@ def _write_shard(task: ShardTask, labels: LabelOptions) -> tuple[int, list[str]]
                     failures.append(str(error))
                     continue
                 for ending, content in files.items():
-                    # No time of writing: the same images give the same file.
+                    # No modification time, so the same images give the same file.
                     member = tarfile.TarInfo(f"{k:06d}_{image.digest}.{ending}")
                     member.size = len(content)
                     tar.addfile(member, io.BytesIO(content))
@@ -245,7 +245,7 @@ def _files_of(
 
 @functools.lru_cache(maxsize=64)
 def _read_members(path: Path) -> list[tuple[str, dict[str, tuple[int, int]]]]:
-    """List the images of a shard: the key of each, and the offset and size of its files."""
+    """List the images of a shard: key, and offset and size of the files of each."""
     samples: dict[str, dict[str, tuple[int, int]]] = {}
     try:
         with tarfile.open(path, "r:") as tar:
@@ -286,7 +286,7 @@ def _damaged(path: Path, reason: object) -> ImageError:
 
 
 def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
-    """Return what of a recipe is fixed once the labels are made, as JSON would give it back."""
+    """Return the options that cannot change after labels are made, as read back from JSON."""
     names = ("short_sides", "square", "max_images", "val_fraction", "augmentations")
     fixed = {name: plain(getattr(options, name)) for name in names}
     return {**fixed, "labels": label_key(options.labels)}

@@ -1,4 +1,4 @@
-"""A training run, of whatever is trained: its steps, validations, files, and how it resumes."""
+"""A training run of any network: steps, validations, files and resuming."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CARD = "MODEL_CARD.md"
 FULL_IMAGE_PIXELS = 480 * 480
 
 CHECKPOINT_INTERVAL_S = 60.0
-"""A killed run loses at most this much time."""
+"""Seconds between checkpoints, so that a killed run loses at most this time."""
 
 
 @dataclass
@@ -70,26 +70,26 @@ class TrainingResult:
 
 
 class Trainer(abc.ABC):
-    """A training run; a class below it says what is trained, its loss and how it is measured.
+    """A training run; subclasses define the network, the loss and the validation.
 
     Attributes:
-        network: all of the state that is trained.
-        average: the exponential average of that state, which is what is measured and saved.
-        average_decay: of the average, in each step; 0: it is the network.
-        optimizers: what trains it.
+        network: the network that is trained.
+        average: exponential average of its state, which is validated and saved.
+        average_decay: decay of the average per step; 0: the average is the network itself.
+        optimizers: the optimisers of its parameters.
         options: the recipe.
-        origin: digests of the images and of the initial weights: a run is resumed with the same
-            recipe and origin only.
-        notes: what else is written into the weights.
+        origin: digests of the images and the initial weights; a run is only resumed if recipe and
+            origin are the same.
+        notes: further notes for the weights file.
         purpose: what the network does, for the model card.
         measures: what the measures are, for the model card.
-        introduction: what the user is told before the first step.
-        steps: of the whole run.
-        milestones: numbers of steps done after which it is validated.
-        objective: the value of a point of the curves that the best weights are chosen by.
-        sign: 1 if its lowest value is the best, -1 if the highest.
+        introduction: lines for the user before the first step.
+        steps: number of steps of the whole run.
+        milestones: numbers of steps after which it is validated.
+        objective: name of the value by which the best weights are chosen.
+        sign: 1 if the lowest value is the best, -1 if the highest is.
         weights_file: name of the file of the best weights.
-        max_gradient_norm: larger gradients are scaled down to it.
+        max_gradient_norm: gradients with a larger norm are scaled down to it.
     """
 
     network: nn.Module
@@ -127,22 +127,22 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def validate(self, step: int) -> dict[str, float]:
-        """Measure the weights after a number of steps."""
+        """Validate the weights after a number of steps."""
 
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        """Write the weights that are measured."""
+        """Write the average weights."""
         save_tensors(self.average.state_dict(), path, dict(notes))
 
     def read_notes(self, path: Path) -> Mapping[str, Any]:
-        """Read the notes of a file of weights; a WeightsError where it is missing."""
+        """Read the notes of a weights file; raise a WeightsError if it is missing."""
         return read_notes(path)
 
     def export(self, folder: Path) -> Path | None:
-        """Write the best weights in another form; return the file."""
+        """Write the best weights in another file format; return the file."""
         return None
 
     def training_step(self, batch: Any, step: int) -> float:
-        """Make one optimiser step after `step` others, and return the loss.
+        """Take an optimiser step after `step` others, and return the loss.
 
         Raises:
             OptionError: the loss or its gradients are not finite.
@@ -163,7 +163,7 @@ class Trainer(abc.ABC):
             )
         for optimizer in self.optimizers:
             optimizer.step()
-        # At first faster, so that the start is soon forgotten.
+        # The average decays faster at first, to forget the initial weights.
         decay = min(self.average_decay, (1 + step) / (10 + step))
         states = (module.state_dict().values() for module in (self.average, self.network))
         for mean, state in zip(*states, strict=True):
@@ -174,7 +174,7 @@ class Trainer(abc.ABC):
         return value
 
     def fit(self, folder: Path, log: Callable[[str], None] | None = None) -> TrainingResult:
-        """Train to the last step in a folder; with a checkpoint there it goes on from it.
+        """Train to the last step, and resume if the folder has a checkpoint.
 
         Raises:
             OptionError: the folder holds a run with other options, images or initial weights.
@@ -186,7 +186,7 @@ class Trainer(abc.ABC):
                 log(line)
         measured = {point["step"] for point in state.points}
         if state.step in self.milestones and state.step not in measured:
-            self._validate(state, folder)  # the start, or a validation that was interrupted
+            self._validate(state, folder)  # the start, or an interrupted validation
         started, pixels = time.monotonic(), 0
         saved = started
         bar = progress(self.steps, "training", "step", log is None, state.step)
@@ -220,7 +220,7 @@ class Trainer(abc.ABC):
         return min(state.points, key=lambda point: self.sign * point[self.objective])
 
     def _validate(self, state: TrainingState, folder: Path) -> None:
-        """Measure the weights, keep them if they are the best so far, and save the state."""
+        """Validate the weights, save them if they are the best so far, and save the state."""
         loss = state.loss_sum / max(state.loss_count, 1)
         point = {"step": state.step, "training_loss": loss, **self.validate(state.step)}
         state.loss_sum, state.loss_count = 0.0, 0
@@ -246,7 +246,7 @@ class Trainer(abc.ABC):
         state = TrainingState(**{name: metadata[name] for name in names})
         restore(tensors, self.network, self.average, self.optimizers)
         if state.points:
-            self.read_notes(folder / self.weights_file)  # an error now rather than at the end
+            self.read_notes(folder / self.weights_file)  # fails now instead of at the end
         return state
 
     def _inputs(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The source images of a run, their views (sizes, light, augmentation), and labels of these."""
+"""Source images of a run, their views (size, light, augmentation), and labels of views."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from .recipe import TrainingOptions
 
 @dataclass(frozen=True)
 class View:
-    """How an image is shown to the network: its shorter side in pixels, and its light.
+    """A view of an image for the network: shorter side in pixels, light and shape.
 
-    Scaled evenly, its middle square, squashed to a square, or the augmented square of a seed.
+    It is the whole image, its central square, the image resized to a square, or an augmented square
+    by a seed.
     """
 
     short_side: int
@@ -35,7 +36,7 @@ class View:
 
     @property
     def name(self) -> str:
-        """A short text, unique among the views of an image and fit for a file name."""
+        """Short name for files, unique among the views of an image."""
         light = "normal"
         if self.darkening is not None:
             light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
@@ -47,7 +48,7 @@ class View:
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image that is trained on or validated with: file, digest of its content, and views."""
+    """An image for training or validation: file, digest of its content, and views."""
 
     path: Path
     digest: str
@@ -56,12 +57,12 @@ class SourceImage:
 
     @property
     def validation_views(self) -> tuple[View, View]:
-        """The normal and the dark view that are validated with."""
+        """The normal and the dark view for validation."""
         return self.normal[0], self.dark[0]
 
 
 def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """List the normal and the dark views of an image: each size in turn, the augmented ones last.
+    """List the normal and the dark views of an image, by size, with augmented views last.
 
     The image's relative path is the seed of its dark and augmented views.
     """
@@ -80,7 +81,7 @@ def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tup
 
 
 def render(image: object, view: View) -> np.ndarray:
-    """Make a view, (H, W, 3) uint8 RGB, of anything `load_image` takes."""
+    """Make a view, (H, W, 3) uint8 RGB, of an image in any form that `load_image` accepts."""
     rgb = load_image(image)
     if view.augmentation is not None:
         rgb = augment(rgb, view.short_side, view.augmentation)
@@ -106,7 +107,7 @@ def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray
 
 
 def label_key(options: LabelOptions) -> str:
-    """Return a digest of everything a label depends on besides the image and the view."""
+    """Return a digest of everything else that changes a label, except image and view."""
     names = options.detectors
     return key({n: [options.parameters(n, "normal"), options.parameters(n, "low")] for n in names})
 
@@ -114,7 +115,7 @@ def label_key(options: LabelOptions) -> str:
 def list_images(
     root: Path, options: TrainingOptions, exclude: Sequence[Path] = (), limit: int | None = None
 ) -> list[SourceImage]:
-    """List the images below a folder; above the limit some, by the checksums of their names."""
+    """List the images in a folder, recursively; a limit selects by checksums of names."""
     paths = find_images(root, exclude)
     if limit is not None and len(paths) > limit:
         chosen = sorted(paths, key=lambda path: (zlib.crc32(path.name.encode()), path))[:limit]
@@ -130,9 +131,9 @@ def list_images(
 def train_val_split(
     images: Sequence[SourceImage], val_fraction: float = 0.05
 ) -> tuple[list[SourceImage], list[SourceImage]]:
-    """Split images into those to train on and about a fraction for validation.
+    """Split images into training images and about a fraction for validation.
 
-    By the checksums of their names, so that an image stays on its side when others are added.
+    Checksums of names decide, so that an image keeps its part when others are added.
     """
     training: list[SourceImage] = []
     validation: list[SourceImage] = []

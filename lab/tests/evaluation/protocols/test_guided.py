@@ -112,5 +112,5 @@ def test_unrelated_images_are_said_to_be_unguided(
         assert row["guided: seconds"] > 0
         assert row["descriptors alone: correct"] is not None
     given = match_images(pair.first, pair.second, options.detector)
-    assert not given.guided
+    assert not given.success
     assert len(given) == len(match_guided(run, options.deepdetect_480(), pair, 0)["points0"]) == 0

@@ -9,7 +9,6 @@ import pytest
 
 from deepdetect import DeepDetect, ImageError
 from deepdetect.detector.heatmap import HeatmapOptions
-from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.io.image import luma
 from deepdetect_lab.evaluation.protocols.masks import (
     NUM_BINS,
@@ -162,21 +161,12 @@ def test_samples_without_a_mask_are_an_error(tmp_path: Path, photo: np.ndarray) 
 
 
 def bundled_scores(shared: Path, backend: str) -> dict[str, MaskScore]:
-    weights = pretrained_weights()
-    if backend == "torch":
-        weights = weights.with_suffix(".safetensors")
-    detector = DeepDetect(weights, backend=backend)
     images = sample_images(shared / "data" / "label-samples" / "val")
-    return score_samples(detector.heatmap, map(load_sample, images))
+    return score_samples(DeepDetect(backend=backend).heatmap, map(load_sample, images))
 
 
 @pytest.mark.parametrize(
-    "backend",
-    [
-        "onnxruntime",
-        pytest.param("openvino", marks=pytest.mark.slow),
-        pytest.param("torch", marks=pytest.mark.slow),
-    ],
+    "backend", ["onnxruntime", pytest.param("openvino", marks=pytest.mark.slow)]
 )
 def test_bundled_weights_score_as_the_results_say(shared: Path, backend: str) -> None:
     """What the model card and README quote, so that these cannot fall behind the weights."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -53,8 +54,8 @@ CORRECT = {"bikes 1-6": 16_447, "leuven 1-6": 58_946, "ubc 1-6": 39_891}
 
 
 @pytest.fixture(scope="module")
-def weights(shared: Path) -> DeepDetect:
-    return DeepDetect(shared / "reference" / "published_matching.safetensors")
+def weights(published: Callable[[str], Path]) -> DeepDetect:
+    return DeepDetect(published("matching"))
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +126,7 @@ def test_sift_low_on_wall_as_in_the_notebook(run: Run, shared: Path) -> None:
 
 
 @pytest.mark.slow
-def test_voxels_of_cones(shared: Path) -> None:
+def test_voxels_of_cones(shared: Path, published: Callable[[str], Path]) -> None:
     """The paper's 49,979, with its second weights, within 0.3 %: the median of three draws.
 
     About 49,950 matches lie on one row. A draw of RANSAC counts these, or, with seed 0, 50,431: an
@@ -133,8 +134,7 @@ def test_voxels_of_cones(shared: Path) -> None:
     is depends on the order of the matches, and so on each of the network's roundings.
     """
     scene = load_calibrated_pair(shared / "data" / "middlebury" / "cones")
-    weights = shared / "reference" / "published_reconstruction.safetensors"
-    detector = DeepDetect(weights).configured(HeatmapOptions(480, "bgr"))
+    detector = DeepDetect(published("reconstruction")).configured(HeatmapOptions(480, "bgr"))
     feature = deepdetect_feature(detector)
     counts = [len(paper_points(feature, scene, seed)[0]) for seed in range(3)]
     assert np.median(counts) == pytest.approx(FIGURE_8["DeepDetect"]["cones"], rel=0.003)

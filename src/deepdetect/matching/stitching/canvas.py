@@ -105,8 +105,8 @@ def plan_plane(
 ) -> tuple[Canvas, dict[int, np.ndarray]]:
     """Find the smallest flat canvas that holds all images.
 
-    `scale` is the number of canvas pixels per pixel of the reference. The given homographies map to
-    any common frame, the returned ones to the canvas.
+    It has `scale` pixels per pixel of the reference. The given homographies map to any common
+    frame, the returned ones to the canvas.
     """
     back = np.linalg.inv(homographies[reference])
     placed = {number: back @ matrix for number, matrix in homographies.items()}

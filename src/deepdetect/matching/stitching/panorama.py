@@ -71,8 +71,7 @@ class Panorama:
         seconds: time of each stage.
         parallax: displacement along the seam of two images, in panorama pixels, for pairs where it
             is visible because the camera moved.
-        closed: whether the panorama shows 360 degrees, so that its right border continues at the
-            left.
+        closed: whether the panorama shows 360 degrees, and its right border continues at the left.
     """
 
     image: np.ndarray

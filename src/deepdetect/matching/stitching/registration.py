@@ -45,15 +45,13 @@ MAX_FURTHER_TRIALS = 2
 """Number of further geometries to try if dense matches reject the first; each takes time."""
 
 MAX_DISAGREEMENT_PX = 2.0
-"""A pair is tried again if the root mean square of its residuals in the fit is larger. Chosen by
-hand; not measured."""
+"""A pair is tried again if its root mean square residual is larger. Chosen by hand."""
 
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MAX_CAMERA_RESIDUAL_PX = 3.0
-"""Cameras that only rotate have smaller residuals at registration size: 0.2 to 1 px without
-parallax."""
+"""Cameras that only rotate have smaller residuals: 0.2 to 1 px without parallax."""
 
 
 @dataclass(frozen=True, eq=False)

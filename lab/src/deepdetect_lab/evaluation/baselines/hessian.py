@@ -15,6 +15,7 @@ from deepdetect.io.image import luma
 from .method import PAPER_DESCRIPTOR, LocalFeature, OwnScaleDescriptor
 
 SIGMA_PX = 3.0
+"""Scale of the baseline with one scale. Chosen by hand; not measured."""
 
 SIGMAS_PX = tuple(float(sigma) for sigma in np.geomspace(1.5, 9.1, 7))
 """Scales in pixels, each 1.35 times the one before. Chosen by hand; not measured."""

@@ -23,6 +23,8 @@ CHANCE_POINTS = 20_000
 this many random points are drawn. Chosen by hand; not measured."""
 
 MAX_DRAWS = 100
+"""The number of draws is limited, because few keypoints would need too many."""
+
 MIN_POINTS_FOR_THREADS = 20_000
 
 CELL_PX = 32

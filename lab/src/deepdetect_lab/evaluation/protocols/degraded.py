@@ -1,4 +1,4 @@
-"""The standard protocol where the second image of each pair is dark or blurred."""
+"""The standard protocol with a dark or blurred second image in each pair."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TEXT = (
 def degraded_sections(
     run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], key: str, title: str
 ) -> list[Section]:
-    """Measure and show all features of the standard protocol, with each degradation."""
+    """Measure and tabulate all features of the standard protocol, with each degradation."""
     sections = []
     for name, degradation in DEGRADATIONS.items() if "degraded" in options.protocols else ():
         made = (
@@ -43,7 +43,7 @@ def degraded_sections(
 
 
 def degraded_pair(pair: PlanarPair, degradation: Degradation, folder: Path) -> PlanarPair:
-    """Return a pair whose second image is a degraded copy in a folder, made where it is missing."""
+    """Return a pair with a degraded copy as second image, created in a folder if missing."""
     digest = file_digest(pair.second)[:16]
     path = folder / "degraded" / f"{digest}-{degradation.name}-v{degradation.version}.png"
     if not path.exists():

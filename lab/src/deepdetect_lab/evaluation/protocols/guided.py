@@ -26,6 +26,7 @@ from ..run import Run
 from .paper import CORRECT_PX, PAPER_MATCHING
 
 SEEDS = 3
+"""Guided matching runs with several seeds, because its random choices change the counts."""
 
 COLUMNS = {
     "pair": "",

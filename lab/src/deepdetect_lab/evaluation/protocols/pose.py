@@ -83,8 +83,8 @@ NOTE = (
 )
 
 Found = tuple[np.ndarray, np.ndarray, float, str]
-"""The (M, 2) matched positions of two images, the seconds that it took, what guided: "homography",
-"fundamental" or "none"; "" for methods that are never guided."""
+"""The (M, 2) matched positions of two images, the seconds, and the geometry that guided:
+"homography", "fundamental" or "none"; "" for methods without guidance."""
 
 
 @dataclass(frozen=True, eq=False)

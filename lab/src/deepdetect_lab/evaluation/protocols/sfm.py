@@ -87,15 +87,14 @@ TEXT = (
 )
 
 CAMERA_NOTE = (
-    "AUC: of the relative poses of all pairs of images, the error being the larger of the angle of "
-    "the rotation and that between the directions of translation, infinite where an image is not "
-    "registered. Centres and rotations: mean errors of the registered cameras after the alignment "
-    "of their centres. From the first row's: "
-    "mean distance of the centres from the first method's; where that is much less than the errors "
-    "of both, these are the truth's, or common to both. The alignment leaves the rotation "
-    "about a straight line of cameras open, so these have no rotations: take the AUC. Track "
-    "length: mean number of images that see a point. Reprojection error: mean over the method's "
-    "own points, so no error of the cameras."
+    "AUC: over the relative poses of all pairs of images. The error is the larger of rotation and "
+    "translation error (angles), and infinite if an image is not registered. Centres and "
+    "rotations: mean errors of the registered cameras after alignment of their centres. From the "
+    "first row's: mean distance of the centres from those of the first method. If it is much "
+    "smaller than the errors of both methods, the ground truth is inaccurate, or both methods "
+    "share an error. For cameras on a straight line the rotation about it is undetermined, so no "
+    "rotation error is given; use the AUC. Track length: mean number of images that see a point. "
+    "Reprojection error: mean over the method's own points; it does not measure the cameras."
 )
 
 COST_NOTE = (

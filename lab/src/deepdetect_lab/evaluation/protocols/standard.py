@@ -46,6 +46,8 @@ RADII_PX = (1.0, 2.0, 3.0)
 SEEDS = 5
 MATCHING_BUDGET = 2048
 RATIO = 0.85
+"""Ratio test for descriptors that are not learned. Chosen by hand; not measured."""
+
 INLIER_THRESHOLD_PX = 3.0
 
 MIN_FILLED = 0.9
@@ -66,7 +68,7 @@ MATCHING_NOTE = (
 def standard_sections(
     run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], *texts: str
 ) -> list[Section]:
-    """Return the section of `standard_section`, where the protocol is wanted."""
+    """Return the section of `standard_section` if the protocol is requested."""
     wanted = "standard" in options.protocols
     return [standard_section(run, options, pairs, *texts)] if wanted else []
 

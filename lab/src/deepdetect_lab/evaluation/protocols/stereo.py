@@ -44,12 +44,12 @@ TEXT = (
 )
 
 NOTE = (
-    "1 - bad-t: fraction of the points with known truth at most t px off; EPE: their mean error; "
-    "completeness: fraction of the pixels with known truth, hidden ones too, with a point at most "
-    "1 px off; F-score: harmonic mean of both. Half-occluded: the true counterpart lies outside "
-    "the right image. The paper's numbers of voxels are the matches that the essential matrix "
-    f"left. Seconds: median of {ROUNDS} runs (ours, SGBM) or one, from images in memory. MB: "
-    "growth of the process, in the largest run."
+    "1 - bad-t: fraction of the points with ground truth whose error is at most t px; EPE: their "
+    "mean error; completeness: fraction of the pixels with ground truth, occluded ones included, "
+    "that have a point with an error of at most 1 px; F-score: harmonic mean of both. "
+    "Half-occluded: the true counterpart is outside the right image. The paper's numbers of voxels "
+    f"are inliers of the essential matrix. Seconds: median of {ROUNDS} runs (ours, SGBM) or one "
+    "run, with images in memory. MB: memory growth of the process, in the largest run."
 )
 
 SHIFTED_NOTE = (
@@ -85,7 +85,7 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
-    """Reconstruct a scene, or read that from the cache.
+    """Reconstruct a scene, cached.
 
     Returns the "pixels", their "disparity", and the columns that do not depend on ground truth.
     """
@@ -117,7 +117,7 @@ def points_table(
     which: str,
     truth: np.ndarray | None,
 ) -> Table:
-    """Tabulate number, accuracy, time and memory of the points of all pipelines."""
+    """Tabulate number and accuracy of the points, time and memory for all pipelines."""
     columns = {
         **{"pipeline": "", "points": ",d", "of them filled": ",d"},
         **{f"1 - bad-{tolerance:g}": ".4f" for tolerance in DISPARITY_TOLERANCES_PX},

@@ -30,8 +30,8 @@ ROUNDS = 3
 """Pipelines that take seconds run this often, and the run of median time is reported."""
 
 Points = tuple[np.ndarray, np.ndarray, int]
-"""(N, 2) float32 pixels of the left image, (N,) float32 disparities, and how many of them were not
-matched but filled in."""
+"""(N, 2) float32 pixels of the left image, (N,) float32 disparities, and the number of filled-in
+disparities."""
 
 
 @dataclass(frozen=True, eq=False)

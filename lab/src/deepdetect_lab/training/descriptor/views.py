@@ -32,10 +32,10 @@ from ..synthetic import (
 )
 
 KEYPOINTS = 256
-"""The most keypoints of a pair: all are compared with all, and 256 fill a view of 256 pixels."""
+"""A pair has at most this many keypoints, since all are compared with all; 256 fill a view."""
 
 LEAST_KEYPOINTS, LEAST_IF_ZOOMED, ZOOMED = 64, 40, 0.8
-"""Pairs that share fewer are drawn again; views zoomed by a logarithm above this one share less."""
+"""Pairs that share fewer keypoints are drawn again. Above the last log zoom the limit is lower."""
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
 """Candidates in the first view that are taken at most, and their largest sigma: larger ones have no
@@ -46,8 +46,8 @@ SIGMA_RANGE_PX = (1.0, 13.0)
 seen."""
 
 MIN_GROWTH = 0.02
-"""Areas that grow by less from the first view to the second are seen from their side, and left
-out."""
+"""Keypoints are left out if areas grow by less from the first to the second view, since such places
+are seen from the side."""
 
 CLEAN_SHARE, RANDOM_SHARE = 0.6, 0.7
 """Shares of the pairs whose keypoints are found in the view before light and noise, as a repeatable
@@ -66,7 +66,7 @@ PLACE_ERROR_PX, PLACE_ERROR_PER_SIGMA, PLACE_ERROR_SIGMA = 0.225, 0.162, 6.0
 its sigma, up to this sigma."""
 
 UNCHANGED_SHARE = 0.15
-"""Share of the views that stay as they are rendered."""
+"""Share of views without changes of light, blur or noise. Chosen by hand; not measured."""
 
 LIGHT = Light(
     field=Effect(0.25, 0, 0.7, power=0.5),
@@ -132,7 +132,7 @@ class Pair(NamedTuple):
 def draw_pair(
     rng: np.random.Generator, files: Sequence[Path], cross_modal: bool = False
 ) -> Pair | None:
-    """Draw a pair of views, as of one or of different sensors; None where they share too little."""
+    """Draw a pair of views of one or of different sensors; None if they share too little."""
     layers, scales, turn = draw_layers(rng, files)
     mixtures: list[np.ndarray | None] = [None, None]
     if cross_modal and happens(rng, MIXED_SHARE):
@@ -188,7 +188,7 @@ def find_keypoints(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_mixture(rng: np.random.Generator) -> np.ndarray:
-    """Draw what a sensor sees of the colours, (1, 3) float32: a channel, or any mixture."""
+    """Draw the colour weights of a sensor, (1, 3) float32: one channel, or a mixture."""
     if happens(rng, ONE_COLOUR_SHARE):
         return np.eye(3, dtype=np.float32)[[int(rng.integers(3))]]
     weights = rng.normal(1 / 3, MIXTURE_DEVIATION, (1, 3)).astype(np.float32)
@@ -198,7 +198,7 @@ def draw_mixture(rng: np.random.Generator) -> np.ndarray:
 def change_tones(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
     """Return a (S, S) float32 view in [0, 1] as another sensor may see it.
 
-    Inverted, by any curve of tones, by two that take turns over the view, or as its edges.
+    The view is inverted, changed by one tone curve or by two in different areas, or shown as edges.
     """
 
     def curve() -> np.ndarray:

@@ -1,7 +1,7 @@
 """Synthetic pairs of views of one photograph, with the homography between them.
 
-Four kinds, as Oxford's scenes have: zoom and rotation, blur, viewpoint, light and JPEG. Each kind
-also gets a little of the others. A pair is a pure function of photograph, kind, size and generator.
+The four kinds are those of Oxford's scenes: zoom and rotation, blur, viewpoint, light and JPEG.
+Each kind also gets a little of the others. A pair depends on photograph, kind, size and generator.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ BORDER_PX = 4
 mirrored."""
 
 SUPERSAMPLING = 2
-"""Views are rendered with twice the pixels along each side, so that nothing is aliased."""
+"""Views are rendered with twice the pixels along each side, so that they are not aliased."""
 
 MAX_ENLARGEMENT = 2.2
-"""Pixels of a view that is zoomed in to one of the photograph, at most: more shows only blur."""
+"""Zoomed views are enlarged by at most this factor, because larger ones only show blur."""
 
 SUBTLE = 0.25
-"""Share of the views with blur, light or JPEG, where the kind does not ask for it."""
+"""Share of views of other kinds with blur, light changes or JPEG. Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),
@@ -73,7 +73,7 @@ that."""
 
 @dataclass(frozen=True)
 class Change:
-    """How the second view of a kind lies to the first one.
+    """Changes from the first to the second view of a kind.
 
     Attributes:
         log_zoom: range of the logarithm of the zoom.
@@ -110,7 +110,7 @@ LEAST_LOG_ZOOM = math.log(1.3)
 be."""
 
 ROTATED_SHARE = 0.2
-"""Share of the pairs that are rotated as a whole, by any angle."""
+"""Share of the pairs that are rotated as a whole, by any angle. Chosen by hand."""
 
 FOCAL_SIDES = (1.2, 3.0)
 """Focal length in sides of the view: fields of view from 45 to 19 degrees."""
