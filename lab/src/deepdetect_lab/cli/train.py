@@ -10,11 +10,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from deepdetect._shared.machine import map_in_processes
 from deepdetect._shared.options import look_up
 from deepdetect._shared.progress import progress
-from deepdetect.batch.engines import ENGINES
 from deepdetect.cli import _options as cli
-from deepdetect.cli.features import EXTRACTION
 
 from ..evaluation.provenance import provenance
 from ..labels import LabelOptions, find_label_settings
@@ -69,8 +68,7 @@ DEVICE = cli.From(DeviceOptions, "device")
 SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides square val_fraction")
 """Options of a recipe that must not change after the shards are written."""
 
-SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
-ENGINE = replace(EXTRACTION, common="")
+SHARDS_RUN = cli.From(write_shards, "shard_size", more="workers")
 PAIRS_RUN = cli.From(
     train_network_on_pairs,
     "validation init_weights device num_workers",
@@ -230,7 +228,7 @@ def train_match_filter(images: Folder, /, *, output: cli.Output, **values: Any) 
     return _train_on_pairs(images, output, MatchFilterTrainingOptions, values)
 
 
-@cli.command(PRESET, LABELS, SHARDS, SHARD_SIZE, ENGINE)
+@cli.command(PRESET, LABELS, SHARDS, SHARDS_RUN)
 def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Pack the images in a folder with their labels into tar files.
 
@@ -245,7 +243,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
         output: Folder for the shards.
     """
     folder = cli.output_folder(output)
-    how = {**SHARD_SIZE.take(values), **_engine(values)}
+    how = SHARDS_RUN.take(values)
     # Shards fit any stages, so a stage for every size is given here.
     recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
     made = write_shards(images, folder, recipe, quiet=False, **how)
@@ -260,12 +258,13 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     )
 
 
-@cli.command(LABELS, cli.From(LabelOptions, "visibility", more=""), ENGINE)
+@cli.command(LABELS, cli.From(LabelOptions, "visibility", more=""))
 def label(
     *images: cli.Images,
     output: cli.Output,
     visualize: bool = False,
     overwrite: cli.Overwrite = False,
+    workers: cli.More[int | None] = None,
     **values: Any,
 ) -> cli.Result:
     """Mark the keypoints and edges of images (files or folders) by nine classical detectors.
@@ -280,9 +279,9 @@ def label(
     Args:
         output: Folder for the masks.
         visualize: Also write STEM_labels.png, the paper's Figure 4.
+        workers: Number of processes.  [default: one per processor]
     """
     folder = cli.output_folder(output)
-    how = _engine(values)
     options = replace(chosen_label_settings(**LABELS.take(values)), **values)
     tasks = []
     for image, stem in cli.result_stems(cli.expand_images(images, folder)).items():
@@ -295,8 +294,9 @@ def label(
     done: list[dict[str, Any]] = []
     failures: list[str] = []
     with progress(len(left), "labelling", "image") as bar:
-        for report in how["map_tasks"](label_file, left, how["workers"]):
-            (failures if isinstance(report, str) else done).append(report)
+        for report in map_in_processes(label_file, left, workers):
+            of_kind: list[Any] = failures if isinstance(report, str) else done
+            of_kind.append(report)
             bar.update(1)
     done.sort(key=lambda report: str(report["image"]))
     skipped = len(tasks) - len(left)
@@ -358,9 +358,3 @@ def average(
         )
         export_onnx(network, made["onnx"])
     return cli.Result(files)
-
-
-def _engine(values: dict[str, Any]) -> dict[str, Any]:
-    chosen = ENGINE.take(values)
-    map_tasks = look_up("engine", chosen.get("engine", "processes"), ENGINES)
-    return {"map_tasks": map_tasks, "workers": chosen.get("workers")}

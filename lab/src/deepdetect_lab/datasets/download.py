@@ -17,8 +17,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import requests
-
 from deepdetect._shared.errors import DeepDetectError, first_line
 from deepdetect._shared.opencv import cv2
 from deepdetect._shared.progress import progress
@@ -157,6 +155,8 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
     Until then the bytes are in `path` with ".part" added, so the next call can resume. If all hosts
     fail, the error of the last host is raised.
     """
+    from requests import RequestException
+
     part = _part(path)
     for k, url in enumerate(file.urls):
         if k and file.checksum is None:
@@ -172,7 +172,7 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
             return
         except DeepDetectError as error:
             failure = error
-        except requests.RequestException as error:
+        except RequestException as error:
             what, advice = type(error).__name__, "run the same command again to resume"
             if error.response is not None:
                 what, advice = f"the server answers {error.response.status_code}", "try again later"
@@ -213,6 +213,8 @@ def _part(path: Path) -> Path:
 
 
 def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
+    import requests
+
     have = file_state(part)[0]
     headers = {"Range": f"bytes={have}-"} if have else {}
     with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_SECONDS) as response:

@@ -23,7 +23,7 @@ import numpy as np
 
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.errors import BatchError, ImageError, OptionError
-from deepdetect._shared.machine import TaskMap, map_in_processes
+from deepdetect._shared.machine import map_in_processes
 from deepdetect._shared.options import suggest_keywords
 from deepdetect._shared.progress import progress
 from deepdetect._shared.records import check_same, key, plain
@@ -128,7 +128,6 @@ def write_shards(
     shard_size: int = 256,
     workers: int | None = None,
     quiet: bool = True,
-    map_tasks: TaskMap = map_in_processes,
 ) -> Shards:
     """Write images with their labels into shards, in parallel over processes.
 
@@ -142,7 +141,6 @@ def write_shards(
         shard_size: approximate number of images per shard.
         workers: number of processes; default one per processor.
         quiet: show no progress bar.
-        map_tasks: function that runs the tasks, instead of processes on this machine.
 
     Raises:
         ImageError: the folder is missing, or has too few images.
@@ -184,7 +182,7 @@ def write_shards(
     total = sum(len(rows) for _, rows in tasks)
     work = functools.partial(_write_shard, labels=options.labels)
     with progress(total, "shards", "image", quiet) as bar:
-        for count, unread in map_tasks(work, tasks, workers):
+        for count, unread in map_in_processes(work, tasks, workers):
             bar.update(count)
             failures += unread
     if failures:
