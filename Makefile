@@ -8,9 +8,11 @@ TORCH := torch==2.13.0
 # Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
 # that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
 PYTEST := -m pytest -q -n 2 --dist loadfile --max-worker-restart 0
-# With COVERAGE=1, as continuous integration runs it, too few lines that run are a failure.
+# What sends signals to its own process runs alone: after other tests in one process it ended the process.
+ALONE := tests/tracking/test_pipeline.py
+# With COVERAGE=1 the lines that run are measured, too.
 COVERAGE ?=
-coverage_flags := $(if $(COVERAGE),--cov --cov-report term:skip-covered)
+coverage_flags := $(if $(COVERAGE),--cov --cov-append --cov-report term:skip-covered)
 export OMP_NUM_THREADS ?= 1
 export UV_PYTHON_DOWNLOADS ?= never
 # The tests start many interpreters: what one has compiled, the next should find.
@@ -37,11 +39,13 @@ demo: $(VENV)/.demo
 
 # The fast tests. Those marked as slow run with `make test-all`.
 test: $(VENV)/.test
-	$(VENV)/bin/python $(PYTEST) $(coverage_flags)
+	$(VENV)/bin/python -m pytest -q $(coverage_flags) $(ALONE)
+	$(VENV)/bin/python $(PYTEST) $(coverage_flags) --deselect $(ALONE)
 
 # All tests, and ten minutes of wrong input and kills.
 test-all: $(VENV)/.test test-opencv4 test-ray test-integrations onnxruntime
-	$(VENV)/bin/python $(PYTEST) --runslow
+	$(VENV)/bin/python -m pytest -q --runslow $(ALONE)
+	$(VENV)/bin/python $(PYTEST) --runslow --deselect $(ALONE)
 	$(VENV)/bin/python -m fuzz --seconds 540 --kills 8
 
 # All wrong input and all kills of docs/limits.md: a quarter of an hour on two cores.
