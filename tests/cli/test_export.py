@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -60,11 +59,3 @@ def test_a_mistake_leaves_nothing(run, words: str, tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("I am no network")
     assert run("export", "onnx", *words.split()).exit_code == 2
     assert [path.name for path in tmp_path.iterdir()] == ["text.onnx"]
-
-
-def test_the_help_shows_size_as_one_word(run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    lines = run("export", "onnx", "--help").stdout.splitlines()
-    (line,) = [line for line in lines if re.match(r"\W*--size ", line)]
-    assert re.search(r"--size [A-Z]+ {2,}\S", line), "one word"
-    assert "480x640" in line
