@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 # What calls the parts of OpenCV that moved between its versions 4 and 5.
 TESTS_OPENCV4 ?= lab/tests/labels tests/features tests/geometry lab/tests/evaluation/baselines \
-	tests/detector/network/test_onnx_export.py
+	tests/detector/onnx_files/test_export.py
 # A quick part that touches most of the packages that these distributions depend on.
 TESTS_LOWEST ?= tests/io tests/detector lab/tests/labels tests/features
 

@@ -20,7 +20,7 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from deepdetect.detector.network.onnx_points import MAX_KEYPOINTS, PREFIX
+from deepdetect.detector.onnx_files.points import MAX_KEYPOINTS, PREFIX
 from deepdetect.detector.points.candidate_features import (
     DETERMINANT_FLOOR,
     GRADIENT_FLOOR,

@@ -77,7 +77,7 @@ def test_points_in_the_file(folder: Path, photo: np.ndarray) -> None:
     """The page's Python on ONNX finds what the package finds."""
     pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
     from deepdetect import PointDetector
-    from deepdetect.detector.network.onnx_export import write_onnx
+    from deepdetect.detector.onnx_files.export import write_onnx
 
     write_onnx("default", "deepdetect.onnx")
     Image.fromarray(photo[:123, :157]).save("photo.jpg", quality=100)

@@ -60,7 +60,7 @@ def test_the_points_are_those_of_the_package(
     height: int, width: int, installed: Path, photo: np.ndarray, tmp_path: Path
 ) -> None:
     pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
-    from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx
+    from deepdetect.detector.onnx_files.export import OnnxOptions, write_onnx
 
     write_onnx("default", tmp_path / "points.onnx", OnnxOptions(maps=False))
     Image.fromarray(photo[:height, :width]).save(tmp_path / "photo.png")

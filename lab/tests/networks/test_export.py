@@ -6,7 +6,7 @@ from pathlib import Path
 import onnx
 import pytest
 
-from deepdetect.detector.network.onnx_graph import read_metadata
+from deepdetect.detector.onnx_files.graph import read_metadata
 from deepdetect.detector.pretrained import PRETRAINED, pretrained_weights
 from deepdetect_lab.networks.export import export_onnx
 from deepdetect_lab.networks.weights import find_weights, load_network

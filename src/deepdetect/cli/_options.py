@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-import os
 import re
 import sys
 import textwrap
@@ -123,8 +122,6 @@ class Result:
 
     def show(self, as_json: bool) -> int:
         """Print the result; return the exit code, or raise the failures as an error."""
-        if os.environ.get("RANK", "0") != "0":  # only the first process of torchrun prints
-            return self.exit_code
         if as_json:
             print(json.dumps(self.values, indent=2, default=str))
         elif text := table(self.values) if self.text is None else self.text:

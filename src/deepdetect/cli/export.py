@@ -12,7 +12,7 @@ from cyclopts import App, Parameter
 
 from .._shared.errors import MissingFileError, OptionError
 from .._shared.records import Outputs
-from ..detector.network.onnx_export import OnnxOptions, write_onnx
+from ..detector.onnx_files.export import OnnxOptions, write_onnx
 from ..detector.point_detector import PointDetector
 from ..detector.pretrained import resolve_weights
 from ..geometry.camera import Camera

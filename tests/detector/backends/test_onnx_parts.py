@@ -42,7 +42,7 @@ def test_the_package_computes_logits_only(tmp_path: Path) -> None:
     onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
     from deepdetect.detector.backends.interface import RuntimeOptions
     from deepdetect.detector.backends.onnxruntime_backend import open_onnxruntime
-    from deepdetect.detector.network.onnx_export import write_onnx
+    from deepdetect.detector.onnx_files.export import write_onnx
 
     path = tmp_path / "points.onnx"
     write_onnx("default", path)

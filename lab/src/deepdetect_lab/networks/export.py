@@ -10,15 +10,30 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnx
 import torch
+from onnx import GraphProto, ModelProto, NodeProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from deepdetect.detector.network.onnx_export import OnnxOptions, write_model
-from deepdetect.detector.network.onnx_graph import add_padding
+from deepdetect.detector.onnx_files.export import OnnxOptions, write_model
+from deepdetect.detector.onnx_files.graph import (
+    IMAGE,
+    PADDED_LOGITS,
+    PROBABILITY,
+    add_constants,
+    ending_nodes,
+    rename,
+    replace_nodes,
+    set_sides,
+)
+from deepdetect.detector.pretrained import LOGITS, PADDED_IMAGE, STRIDE
 
 OPSET = 17
 """Version of the ONNX operator set, which ONNX Runtime 1.24, OpenVINO and OpenCV 4 can read."""
+
+_FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
+"""Shape of a factor per output channel that scales a kernel, by type of convolution."""
 
 
 def to_onnx(
@@ -62,3 +77,92 @@ def export_onnx(network: nn.Module, path: str | Path) -> None:
     )
     add_padding(model)
     write_model(model, path, OnnxOptions(max_keypoints=0), {})
+
+
+def add_padding(model: ModelProto) -> None:
+    """Extend a network from `image` to `logits`: accept any size, and also output probabilities.
+
+    The image's last row and column are repeated up to multiples of 8, and the maps are cropped, as
+    in `compute_maps`. Probabilities are at most 1. Batch normalisation is folded.
+    """
+    graph = model.graph
+    fold_normalisation(graph)
+    give_four_dimensions(graph)
+    rest = list(graph.node)
+    for node in rest:
+        rename(node, IMAGE, PADDED_IMAGE)
+        rename(node, LOGITS, PADDED_LOGITS)
+    add_constants(graph, {"first_side": [2], "end_of_sides": [4], "side_axis": [0]})
+    add_constants(graph, {"stride": [STRIDE], "no_padding": [0] * 6})
+    before = [
+        helper.make_node("Shape", [IMAGE], ["shape"]),
+        helper.make_node("Slice", ["shape", "first_side", "end_of_sides", "side_axis"], ["sides"]),
+        helper.make_node("Neg", ["sides"], ["minus_sides"]),
+        helper.make_node("Mod", ["minus_sides", "stride"], ["missing"]),
+        helper.make_node("Concat", ["no_padding", "missing"], ["padding"], axis=0),
+        helper.make_node("Pad", [IMAGE, "padding"], [PADDED_IMAGE], mode="edge"),
+    ]
+    replace_nodes(graph, [*before, *rest, *ending_nodes(graph)])
+    graph.output.insert(0, graph.output[0])
+    graph.output[0].name = PROBABILITY
+    set_sides(graph, "dim_param", batch="batch", height="height", width="width")
+
+
+def fold_normalisation(graph: GraphProto) -> None:
+    """Fold batch normalisation into the preceding convolution, or into a factor and an offset.
+
+    It is computed in float64, so that the same weights give the same numbers everywhere: PyTorch's
+    exporter rounds differently on different processors. Convolutions must not have a bias yet.
+    """
+    values = {one.name: one for one in graph.initializer}
+    made = {name: node for node in graph.node for name in node.output}
+    for node in graph.node:
+        if node.op_type == "Identity" and node.input[0] in values:  # equal weights stored once
+            values[node.output[0]] = values[node.input[0]]
+    folded: list[NodeProto] = []
+    for node in graph.node:
+        if node.op_type != "BatchNormalization":
+            folded.append(node)
+            continue
+        weight, bias, mean, variance = (
+            numpy_helper.to_array(values[name]).astype(np.float64) for name in node.input[1:]
+        )
+        epsilon = next(one.f for one in node.attribute if one.name == "epsilon")
+        factor = weight / np.sqrt(variance + epsilon)
+        offset = bias - mean * factor
+        source, target = node.input[0], node.output[0]
+        before = made[source]
+        if before.op_type in _FACTOR_SHAPES:
+            name = before.input[1]
+            shape = _FACTOR_SHAPES[before.op_type]
+            kernel = numpy_helper.to_array(values[name]) * factor.reshape(shape)
+            arrays = {f"{name}.folded": kernel, f"{name}.bias": offset}
+            before.input[:] = [before.input[0], *arrays]
+            for other in graph.node:  # `tiling` uses the names of PyTorch's exporter
+                rename(other, target, source)
+        else:
+            both = {f"{target}.factor": factor, f"{target}.offset": offset}
+            arrays = {name: array[:, None, None] for name, array in both.items()}
+            product = f"{target}.product"
+            folded.append(helper.make_node("Mul", [source, f"{target}.factor"], [product]))
+            folded.append(helper.make_node("Add", [product, f"{target}.offset"], [target]))
+        add_constants(graph, arrays, np.float32)
+    replace_nodes(graph, folded)
+
+
+def give_four_dimensions(graph: GraphProto) -> None:
+    """Store numbers per channel as (1, C, 1, 1) instead of the equivalent (C, 1, 1).
+
+    For three dimensions OpenVINO transposes the image before and after each sum, product or PReLU
+    with such a constant, which took a third of the time.
+    """
+    used = {
+        name
+        for node in graph.node
+        if node.op_type in ("Add", "Mul", "PRelu")
+        for name in node.input
+    }
+    for one in graph.initializer:
+        if one.name in used and len(one.dims) == 3 and list(one.dims[1:]) == [1, 1]:
+            values = numpy_helper.to_array(one)
+            one.CopyFrom(numpy_helper.from_array(values[None], one.name))

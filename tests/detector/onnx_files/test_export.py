@@ -14,7 +14,7 @@ import onnxruntime  # noqa: E402
 
 from deepdetect import OptionError, WeightsError  # noqa: E402
 from deepdetect.detector.backends.onnx_parts import cut_onnx  # noqa: E402
-from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx  # noqa: E402
+from deepdetect.detector.onnx_files.export import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 
 SIZES = [(64, 96), (123, 157), (80, 41)]

@@ -15,7 +15,7 @@ from ..._shared.errors import OptionError, WeightsError, require_packages
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.selection import check_max_keypoints
 from ..pretrained import LOGITS, resolve_weights
-from .onnx_graph import (
+from .graph import (
     IMAGE,
     PROBABILITY,
     fix_size,
@@ -23,7 +23,7 @@ from .onnx_graph import (
     replace_nodes,
     write_metadata,
 )
-from .onnx_points import add_points, remove_points
+from .points import add_points, remove_points
 
 if TYPE_CHECKING:
     from onnx import ModelProto

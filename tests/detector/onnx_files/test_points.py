@@ -15,7 +15,7 @@ onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting on
 import onnxruntime  # noqa: E402
 
 from deepdetect import PointDetector, load_image  # noqa: E402
-from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx  # noqa: E402
+from deepdetect.detector.onnx_files.export import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import POINTS  # noqa: E402
 
 NEAR_PX = 0.05

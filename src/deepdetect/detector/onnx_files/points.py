@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..pretrained import POINTS, POINTS_GRAPH
-from .onnx_graph import replace_nodes
+from .graph import replace_nodes
 
 if TYPE_CHECKING:
     from onnx import ModelProto

@@ -1,1 +1,0 @@
-"""Export of the network as ONNX files for other programs."""
