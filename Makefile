@@ -10,9 +10,6 @@ TORCH := torch==2.13.0
 PYTEST := -m pytest -q -n 2 --dist loadfile --max-worker-restart 0
 # What sends signals to its own process runs alone: after other tests in one process it ended the process.
 ALONE := tests/tracking/test_pipeline.py
-# With COVERAGE=1 the lines that run are measured, too.
-COVERAGE ?=
-coverage_flags := $(if $(COVERAGE),--cov --cov-append --cov-report term:skip-covered)
 export OMP_NUM_THREADS ?= 1
 export UV_PYTHON_DOWNLOADS ?= never
 # The tests start many interpreters: what one has compiled, the next should find.
@@ -32,15 +29,19 @@ EVERYTHING := --all-packages --all-extras
 export = $(VENV)/bin/uv export --quiet --locked --all-packages --all-extras --no-emit-workspace --format $(1)
 install_torch = $(VENV)/bin/python -m pip --python $(1)/bin/python install $(PIP_FLAGS) --no-compile --no-deps $(TORCH)
 
-.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web hub lint spelling types contracts check \
+.PHONY: demo test coverage test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web hub lint spelling types contracts check \
 	format lock upgrade check-lock audit sbom docs test-docs notebooks figures results release-check clean
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
 
 # The fast tests. Those marked as slow run with `make test-all`.
 test: $(VENV)/.test
-	$(VENV)/bin/python -m pytest -q $(coverage_flags) $(ALONE)
-	$(VENV)/bin/python $(PYTEST) $(coverage_flags) --deselect $(ALONE)
+	$(VENV)/bin/python -m pytest -q $(ALONE)
+	$(VENV)/bin/python $(PYTEST) --deselect $(ALONE)
+
+# The fast tests, and the lines that they run. One process: of two that are measured, one may crash.
+coverage: $(VENV)/.test
+	$(VENV)/bin/python -m pytest -q --cov --cov-report term:skip-covered
 
 # All tests, and ten minutes of wrong input and kills.
 test-all: $(VENV)/.test test-opencv4 test-ray test-integrations onnxruntime

@@ -25,7 +25,7 @@ def put(monkeypatch: pytest.MonkeyPatch, **names: object) -> None:
     monkeypatch.setitem(sys.modules, "cv2", other)
 
 
-@pytest.mark.parametrize("version", ["4.12.0", "4.14.0-pre", "5.0.0"])
+@pytest.mark.parametrize("version", ["4.13.0", "4.14.0-pre", "5.0.0"])
 def test_new_enough(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
     put(monkeypatch, __version__=version, resize=7)
     assert opencv.cv2.resize == 7

@@ -57,7 +57,7 @@ def test_a_working_installation(run: Run) -> None:
     ("imported", "modules", "packages", "status"),
     [
         ("5.0.0", (), {"opencv_python_headless": "5.0.0.93"}, "ok"),
-        ("4.12.0", (), {"opencv_python_headless": "5.0.0.93"}, "problem"),
+        ("4.13.0", (), {"opencv_python_headless": "5.0.0.93"}, "problem"),
         (
             *("5.0.0", ()),
             {"opencv_python_headless": "5.0.0.93", "opencv_contrib_python_headless": "5.0.0.93"},
@@ -87,7 +87,7 @@ def test_packages_that_are_too_old_or_absent(monkeypatch: pytest.MonkeyPatch) ->
     lines = [
         "numpy>=2.0",
         "tqdm>=99.1",
-        "opencv-python-headless>=4.12",
+        "opencv-python-headless>=4.13",
         'h5py>=3.11 ; extra == "sfm"',
         "no-such-package>=1.17; extra == 'app'",
         "deepdetect[app,sfm]; extra == 'all'",

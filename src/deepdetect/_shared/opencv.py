@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from .errors import MissingExtraError, first_line, require_packages
 from .signals import sigterm_kept
 
-LOWEST_VERSION = "4.12"
-"""Lowest supported version: older ones cannot write the EXIF of an image."""
+LOWEST_VERSION = "4.13"
+"""Lowest supported version: 4.12 writes images without their ICC profiles, and says nothing."""
 
 DISTRIBUTIONS = (
     "opencv-python",
