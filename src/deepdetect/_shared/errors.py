@@ -137,10 +137,7 @@ def install_command(*packages: str) -> str:
 
 
 def require_packages(what: str, *packages: str) -> None:
-    """Raise a MissingExtraError if one of the packages is not installed.
-
-    `what` names the thing that needs them, at the start of the message.
-    """
+    """Raise a MissingExtraError if one of the packages that `what` needs is not installed."""
     missing = [package for package in packages if importlib.util.find_spec(package) is None]
     if missing:
         names = ", ".join(missing)
@@ -152,10 +149,9 @@ def require_packages(what: str, *packages: str) -> None:
 
 @contextmanager
 def noted_failures(name: str, failures: list[str]) -> Iterator[None]:
-    """Add an error that the block raises to `failures`, so that other inputs are still processed.
+    """If the block fails for the input `name`, note the error, so that other inputs are processed.
 
-    `name` is the input's name. A missing package and wrong weights would affect all inputs, so
-    these errors are raised.
+    Errors that would affect all inputs, a missing package or wrong weights, are still raised.
     """
     try:
         yield

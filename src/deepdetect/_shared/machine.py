@@ -99,7 +99,7 @@ def map_in_processes(
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")
-    most = 61 if os.name == "nt" else len(tasks)  # Windows cannot wait for more than 61
+    most = 61 if os.name == "nt" else len(tasks)  # Windows cannot wait for more than 61 processes
     count = min(workers or processor_count(), most, len(tasks))
     if count <= 1:
         with one_opencv_thread():
@@ -117,7 +117,7 @@ def map_in_processes(
     pending: deque[Future[Outcome]] = deque()
 
     def submit(most: int) -> None:
-        # The first submissions start the processes, which inherit both settings.
+        # The processes start at the first submissions, with Ctrl-C deferred and one thread.
         with signals_held(), _one_thread_inherited():
             for task in islice(remaining, most):
                 pending.append(pool.submit(_run_task, function, task))
@@ -152,7 +152,7 @@ def _end_workers(pool: ProcessPoolExecutor) -> None:
 
 @contextmanager
 def _one_thread_inherited() -> Iterator[None]:
-    """Let libraries in processes that the block starts use one thread, unless the user set more."""
+    """Start processes in the block with one thread per library, unless the user set a number."""
     unset = [name for name in _THREAD_VARIABLES if name not in os.environ]
     os.environ.update(dict.fromkeys(unset, "1"))
     try:

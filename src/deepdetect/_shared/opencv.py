@@ -113,12 +113,12 @@ def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
 
 def installed_distributions() -> list[str]:
     """Return the installed packages that contain `cv2`."""
-    import importlib.metadata  # late, as it takes longer than importing DeepDetect
+    import importlib.metadata  # late: it takes longer than importing DeepDetect
 
     installed = {each.name for each in importlib.metadata.distributions()}
     return [name for name in DISTRIBUTIONS if name in installed]
 
 
 def version_numbers(version: str) -> list[int]:
-    """Return the numbers in a version string, which compare as versions do."""
+    """Return the numbers in a version string, for comparing versions."""
     return [int(part) for part in re.findall(r"\d+", version)]

@@ -29,8 +29,8 @@ def suggest_keywords(
 ) -> Callable[Parameters, Result]:
     """Decorate a function so that an unknown keyword raises an error that suggests a known one.
 
-    An argument of a wrong type also raises an error, if its annotation consists of types in
-    `ACCEPTED` and dataclasses. The function keeps its signature. A class is decorated above
+    An argument of a wrong type also raises an error, if its annotation consists only of types in
+    `ACCEPTED` or dataclasses. The function keeps its signature. A class is decorated above
     `@dataclass`, and stays the same class. `elsewhere` maps keywords that only other functions have
     to advice on what to do instead.
     """
@@ -116,7 +116,7 @@ def whole(name: str, value: Any) -> int:
     """Return a number as an int, or raise an OptionError if it is negative or not whole."""
     number: Any = value if isinstance(value, Real) else -1
     if number < 0 or not float(number).is_integer():
-        raise OptionError(f"`{name}` must be a whole number from 0 on, not {shown(value)}")
+        raise OptionError(f"`{name}` must be a whole number of at least 0, not {shown(value)}")
     return int(number)
 
 
@@ -146,7 +146,7 @@ def check_ranges(
     bounds = [(name, math.ulp(0), LARGEST, "be above 0") for name in positive]
     bounds += [(name, 0, LARGEST, "be 0 or more") for name in not_negative]
     bounds += [(name, 0, 1, "lie in [0, 1]") for name in fractions]
-    bounds += [(name, 1, math.inf, "be a whole number from 1 on") for name in counts]
+    bounds += [(name, 1, math.inf, "be a whole number of at least 1") for name in counts]
     for name, (smallest, largest) in between.items():
         limits = f"lie in [{smallest:.12g}, {largest:.12g}]"
         expected = f"be at least {smallest:.12g}" if largest == math.inf else limits

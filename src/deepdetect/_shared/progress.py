@@ -33,10 +33,7 @@ STDERR: Any = _StandardError()
 
 
 def fails(stream: Any) -> bool:
-    """Return whether writing to a stream fails, because of a full disk or a broken pipe.
-
-    If it fails, further output to the stream is discarded.
-    """
+    """Return whether writing to a stream fails (full disk, broken pipe); then discard its output."""
     if stream is None:
         return False
     try:

@@ -44,10 +44,7 @@ def key(*values: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return a value of a type that `key` takes as JSON would restore it.
-
-    Bytes, arrays and files become digests.
-    """
+    """Return a value as JSON restores it, with digests for bytes, arrays and files. See `key`."""
     match value:
         case None | bool() | int() | float() | str():
             return value
@@ -92,7 +89,7 @@ def _file_digest(path: Path, size: int, changed: int) -> str:
 
 
 def file_state(path: Path) -> tuple[int, int]:
-    """Return the size of a file in bytes and the time of its last change in ns; else zeros."""
+    """Return a file's size in bytes and its time of change in ns, or zeros if it is missing."""
     try:
         status = path.stat()
     except OSError:

@@ -26,7 +26,7 @@ def import_onnxruntime() -> ModuleType:
 
 def import_openvino() -> ModuleType:
     """Import OpenVINO as if the optional openvino_telemetry were not installed."""
-    # The only variable against its telemetry is CI, which other packages also read: it is not set.
+    # Only the variable CI turns its telemetry off. It is not set, as other packages also read it.
     return _import_with("openvino", sys.modules, "openvino_telemetry", None)
 
 

@@ -102,7 +102,7 @@ def end_by_interrupt() -> None:
 
 
 def end_worker_by_signals() -> None:
-    """Let SIGTERM and Ctrl-C end a worker process by SystemExit, also if Ctrl-C was deferred."""
+    """Let SIGTERM and Ctrl-C end a worker process by SystemExit, even if Ctrl-C was deferred."""
     both = (signal.SIGINT, signal.SIGTERM)
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -117,7 +117,7 @@ def end_worker_by_signals() -> None:
 
 
 def kill_group(process: int = 0) -> None:
-    """Kill all processes in the group of a process, by default this one; not on Windows."""
+    """Kill all processes in the group of a process, by default this one's; not on Windows."""
     if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Running tasks: each has a process and a folder, which end when the page no longer asks for it."""
+"""Running tasks: each has a process and a folder, which are removed if the page stops asking."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class AppOptions:
 
     Attributes:
         port: port of 127.0.0.1; 0 takes any free one.
-        max_file_mb: size of the largest image file, in megabytes.
+        max_file_mb: largest size of an image file, in megabytes.
         max_task_mb: largest total size of the image files of one task, in megabytes.
         max_files: largest number of images of one task.
         max_megapixels: larger images are rejected before they are decoded.

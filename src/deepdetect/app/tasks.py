@@ -45,7 +45,7 @@ Options = Mapping[str, float]
 
 @dataclass(frozen=True)
 class SentImage:
-    """Image file that the page sent. Its user's `name` for it is never used as a path."""
+    """Image file that the page sent. The user's `name` for it is never used as a path."""
 
     path: Path
     name: str
@@ -56,7 +56,7 @@ Images = Sequence[SentImage]
 
 @dataclass(frozen=True)
 class Order:
-    """A task to run. `folder` is its own folder, which contains the images."""
+    """A task to run. `folder` belongs to this task only, and contains the images."""
 
     kind: str
     images: Images
@@ -303,7 +303,7 @@ TASKS: dict[str, Task] = {
     ),
     "folder-keypoints": Task(
         "Keypoints",
-        "the best of each image, as CSV files",
+        "the best keypoints of each image, as CSV files",
         run_folder_keypoints,
         (1, None),
         folder=True,

@@ -127,7 +127,7 @@ def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
             object_store_memory=OBJECT_STORE_BYTES,
             **quiet,
         )
-    except Exception as error:  # Ray raises many types, after half a minute
+    except Exception as error:  # Ray raises errors of many types, after half a minute
         ray.shutdown()
         raise DeepDetectError(
             f"Ray cannot start ({first_line(error)}): try later, or use the engine 'processes'"

@@ -79,7 +79,7 @@ argument or a failure to its third."""
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What an extraction or matching did.
+    """Outcome of an extraction of features, or of a matching of pairs.
 
     Attributes:
         path: the file.
@@ -165,10 +165,7 @@ def _written(path: Path, mode: str) -> Iterator[Any]:
 
 
 def write_groups(path: Path, groups: Iterable[Group]) -> None:
-    """Write groups one by one to a file, which appears complete or not at all.
-
-    If there are no groups, no file is written.
-    """
+    """Write groups one by one to a file, complete or not at all; without groups, write no file."""
     groups = iter(groups)
     first = next(groups, None)
     if first is None:

@@ -48,7 +48,7 @@ def read_pairs(path: str | Path) -> list[Pair]:
 
 
 def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
-    """Write a list of pairs for `read_pairs` and hloc, which cannot read names with blanks."""
+    """Write a list of pairs that `read_pairs` can read, and also hloc if no name has blanks."""
     blanks = any(" " in name for pair in pairs for name in pair)
     lines = [("\t" if blanks else " ").join(pair) + "\n" for pair in pairs]
     with atomic_path(path) as temporary:

@@ -235,7 +235,7 @@ def _match_pairs(
     options: PairMatchingOptions,
 ) -> Iterator[Group]:
     with open_hdf5(features) as file:
-        first: tuple[str, Keypoints] | None = None  # kept, as pairs are sorted by it
+        first: tuple[str, Keypoints] | None = None  # kept: pairs are sorted by their first image
         for (name0, name1), state in pairs:
             with noted_failures(f"{name0} {name1}", failures):
                 if first is None or first[0] != name0:

@@ -84,7 +84,7 @@ def vlad_vectors(
     seed: int = 0,
     done: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Describe each image by a VLAD vector, in which the residuals of each word have unit length.
+    """Describe each image by a VLAD vector, in which each word's sum of residuals has unit length.
 
     `descriptors(i)` returns the descriptors of image i, (N_i, D) float32 of unit length. Returns
     (M, words * D) vectors of unit length, and the (M,) indices of their images. Images without

@@ -106,10 +106,9 @@ class DeepDetectMatcher(BaseModel):
     """Nearest-neighbour matcher with the ratio test, for `hloc.match_features`.
 
     The options `ratio` and `mutual` are those of `match_features`. It matches the features of any
-    extractor whose descriptors are compared by Euclidean distance. If the option
-    `descriptor` is "learned", the features must be those of `DeepDetectExtractor` with `oris` in
-    degrees. The matcher then finds more matches, because it takes the rotation between the images
-    into account.
+    extractor whose descriptors are compared by Euclidean distance. If `descriptor` is "learned",
+    the features must be those of `DeepDetectExtractor` with `oris` in degrees. The matcher then
+    finds more matches, because it takes the rotation between the images into account.
     """
 
     default_conf: dict[str, Any] = {  # noqa: RUF012

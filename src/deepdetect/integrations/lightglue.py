@@ -23,8 +23,8 @@ from torch.nn import Module
 Scale = Literal["diameter", "sigma"]
 
 MAX_KEYPOINTS = 4096
-"""Maximum number of keypoints. LightGlue's SIFT extractor has the same limit, because LightGlue's time
-and memory grow with the square of the number of keypoints."""
+"""Maximum number of keypoints, as in LightGlue's own SIFT extractor, because LightGlue's time and
+memory grow with the square of it."""
 
 
 class DeepDetectExtractor(Module):

@@ -27,7 +27,7 @@ def load_tensor(image: Any) -> np.ndarray:
 
 
 def padded(rows: Sequence[Any], device: torch.device) -> torch.Tensor:
-    """Stack arrays or tensors of different lengths to one tensor, padded with zeros at the ends."""
+    """Stack arrays or tensors of different lengths into one tensor; pad the ends with zeros."""
     import torch
 
     tensors = [torch.as_tensor(values) for values in rows]

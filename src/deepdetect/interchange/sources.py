@@ -1,4 +1,4 @@
-"""Collections from images, or from files of `extract`, `match-many`, `detect` and `match`."""
+"""Collections from a folder of images, or from keypoints and matches in files."""
 
 from __future__ import annotations
 
@@ -76,9 +76,7 @@ def read_features_file(path: Path) -> dict[str, Keypoints]:
     with open_hdf5(path) as file:
         found = {name: read_keypoints(file, name) for name in sorted(feature_names(file))}
     if not found:
-        raise InvalidFileError(
-            f"{path} has no features: give a file written by `deepdetect extract`"
-        )
+        raise InvalidFileError(f"{path} has no features: give a file written by deepdetect extract")
     return found
 
 
@@ -124,7 +122,7 @@ def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pa
                 _add_matches(found, (pair[0], pair[1]), PairMatches.one_to_one(rows, kept))
     if not found:
         raise InvalidFileError(
-            f"{path} has no matches: give a file written by `deepdetect match-many`"
+            f"{path} has no matches: give a file written by deepdetect match-many"
         )
     return found
 
@@ -185,7 +183,7 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
 
 
 def _name_of(path: Path, names: Mapping[str, str]) -> str:
-    """Return the name of the image that is named by the longest possible end of an npz path."""
+    """Return the image name that belongs to the longest known end of an npz file's path."""
     parts = path.with_suffix("").parts
     for first in range(len(parts)):
         if (key := "/".join(parts[first:])) in names:

@@ -238,7 +238,7 @@ def _caption(text: str, width: int, unit: float) -> np.ndarray:
 
 
 def join_pictures(panels: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Join images of one size to a grid with this number of columns and white gaps."""
+    """Join images of one size in a grid of `columns` columns, with white gaps."""
     height, width = panels[0].shape[:2]
     rows = -(-len(panels) // columns)
     size = rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3
