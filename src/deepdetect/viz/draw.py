@@ -145,7 +145,7 @@ def draw_logits(logits: np.ndarray) -> np.ndarray:
     low, high = shown_range(known)
     low, high = min(low, -1.0), max(high, 1.0)
     levels = np.where(np.isfinite(shown), (known - low) / (high - low), shown > 0)
-    words = "logit of a keypoint, 0 is a probability of 0.5"
+    words = "logit of a keypoint; 0 is a probability of 0.5"
     return add_scale(draw_heatmap(levels), words, low, high)
 
 
