@@ -134,9 +134,9 @@ def _channels_last(array: np.ndarray) -> np.ndarray:
 
 
 def _select_bands(array: np.ndarray, bands: Sequence[int], name: str) -> np.ndarray:
-    """Return the chosen bands, numbered from 1, as the last axis.
+    """Return the chosen bands, whose numbers start at 1, as an array (H, W, bands).
 
-    The bands of the image are the shorter one of its first and last axes.
+    In `array`, the axis of the bands is the shorter one of the first and the last axis.
     """
     if array.ndim == 3 and array.shape[0] < array.shape[2]:
         array = np.moveaxis(array, 0, 2)
@@ -179,7 +179,7 @@ def _tell_if_dark(used: float, name: str) -> None:
 
 
 def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
-    """Scale values linearly to uint8 or uint16; `value_range` gives those of black and white."""
+    """Scale values linearly to uint8 or uint16; `value_range` gives the values of black and white."""
     (low, high), size = value_range, array.dtype.itemsize
     if array.dtype == np.uint8 and (low, high) == (0, 255):
         return array

@@ -1,4 +1,4 @@
-"""Compilation of kernels by numba, each at its first call, with a cache on disk.
+"""Compilation of kernels by numba: each is compiled at its first call and cached on disk.
 
 If numba cannot write to its usual cache folders, as in a read-only container, it uses a private
 folder of this user in the temporary directory. If that folder cannot be made, nothing is cached.

@@ -70,5 +70,5 @@ def start_session(
     # A fallback to the CPU after a failure would print blocks of text.
     session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)
     session.disable_fallback()
-    session._model_bytes = None  # the contents of the file, kept only for a fallback
+    session._model_bytes = None  # frees the file's contents, kept for a fallback
     return session
