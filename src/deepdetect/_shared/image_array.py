@@ -179,7 +179,7 @@ def _tell_if_dark(used: float, name: str) -> None:
 
 
 def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
-    """Scale values linearly to uint8 or uint16; `value_range` gives the values of black and white."""
+    """Scale to uint8 or uint16; `value_range` gives the values that become black and white."""
     (low, high), size = value_range, array.dtype.itemsize
     if array.dtype == np.uint8 and (low, high) == (0, 255):
         return array

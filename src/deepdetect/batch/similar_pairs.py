@@ -34,8 +34,8 @@ TRAINING_IMAGES, TRAINING_DESCRIPTORS = 500, 50_000
 time."""
 
 COMPARED_ROWS = 256
-"""The vectors of this many images are compared at once with those of all images, which takes 300 MB of
-memory for a collection of 100,000 images."""
+"""The vectors of this many images are compared at once with those of all images, which takes 300 MB
+of memory for a collection of 100,000 images."""
 
 
 def similar_pairs(
