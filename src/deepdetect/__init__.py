@@ -11,6 +11,6 @@ import lazy_loader
 
 __version__ = "1.0.0rc1"
 
-# Names are imported at their first use, so that the command line starts fast. They are listed in
-# `__init__.pyi`, which type checkers and editors also read.
+# Each name is imported at its first use, so that the command line starts fast. The names are listed
+# in `__init__.pyi`, which type checkers and editors also read.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""`python -m deepdetect` and the command `deepdetect`."""
+"""Entry point of `python -m deepdetect` and of the command `deepdetect`."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from ._shared.progress import STDERR, fails
 from ._shared.signals import noted_interrupts
 
 OPENCV_SETTINGS = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
-"""These variables keep OpenCV and its FFmpeg from printing lines next to our error messages.
+"""Environment variables that keep OpenCV and its FFmpeg from printing beside our error messages.
 
-OpenCV reads them from the environment when it is loaded. A user's own setting stays, and programs
-that import this package are not affected.
+OpenCV reads them when it is loaded. A user's own setting stays, and programs that import this
+package are not affected.
 """
 
 STOPPED = 130
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends it with exit code 130, also during imports."""
-    # Else a file could get the descriptor of a closed stream, and then what libraries print.
+    """Run the command line; Ctrl-C ends it with exit code 130, even during imports."""
+    # Closed standard streams are opened. Otherwise a file could get the descriptor of one, and what
+    # libraries print would be written into that file.
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(number)
     for name, value in OPENCV_SETTINGS.items():
         os.environ.setdefault(name, value)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="surrogateescape")  # file names may be any bytes
+        sys.stdout.reconfigure(errors="surrogateescape")  # file names may contain any bytes
     with noted_interrupts() as interrupts:
         try:
             from .cli import main as command
@@ -43,7 +44,7 @@ def main() -> None:
     if interrupts and code not in (None, 0, STOPPED):
         print("deepdetect: stopped; what was written stays", file=STDERR)
         code = STOPPED
-    fails(sys.stderr)  # a full disk would else change the exit code
+    fails(sys.stderr)  # otherwise a full disk changes the exit code
     sys.exit(code)  # type: ignore[arg-type]
 
 

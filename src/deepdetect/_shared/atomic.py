@@ -19,10 +19,12 @@ from pathlib import Path
 from .errors import DeepDetectError
 
 ABANDONED_S = 24 * 3600.0
-"""A temporary file of another machine is abandoned if it is older than this. Chosen by hand."""
+"""A temporary file that another machine made counts as abandoned if it is older than this, in
+seconds. Chosen by hand."""
 
 STEM_LENGTH = 40
-"""A temporary name contains at most this many characters of the final name, which may be long."""
+"""A temporary name repeats at most this many characters of the final name, because a longer name
+could exceed the file system's limit."""
 
 # The owner in a temporary name is a machine, a process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
@@ -33,22 +35,23 @@ _TEMPORARY = re.compile(rf"\..*\.{_OWNER.pattern}\.part(\..*)?")
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path with the same suffix, which is renamed when the block succeeds.
+    """Yield a temporary path with the same suffix; rename it to `path` if the block succeeds.
 
-    Missing folders are made. Temporary files of killed processes are removed.
+    Missing folders are created. Temporary files that killed processes left there are removed.
 
     Raises:
-        DeepDetectError: the file cannot be written (no permission, no space, not a folder).
+        DeepDetectError: the file cannot be written: there is no permission or no space, or its
+            parent is not a folder.
     """
     final = Path(path)
     temporary = final.with_name(f".{final.stem[:STEM_LENGTH]}.{_owner()}.part{final.suffix}")
     try:
         _clear(final.parent.absolute())
         final.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch(exist_ok=False)  # keeps the folder from being removed as empty
+        temporary.touch(exist_ok=False)  # so that no process removes the empty folder
         yield temporary
         temporary.replace(final)
-    except DeepDetectError:  # the error for a missing file is also an OSError
+    except DeepDetectError:  # MissingFileError is also an OSError
         raise
     except OSError as error:
         raise DeepDetectError(
@@ -60,9 +63,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def private_folder(prefix: str) -> Path:
-    """Make a folder for temporary files that only this user can read; the caller removes it.
+    """Make a temporary folder that only this user can read; the caller removes it.
 
-    Folders with the same prefix whose processes have ended are removed.
+    Older folders with the same prefix are removed if the processes that made them have ended.
 
     Raises:
         DeepDetectError: no folder for temporary files is writable.
@@ -70,7 +73,7 @@ def private_folder(prefix: str) -> Path:
     try:
         parent = Path(tempfile.gettempdir())
         for path in _abandoned(parent, re.compile(re.escape(prefix) + _OWNER.pattern)):
-            shutil.rmtree(path, ignore_errors=True)  # fails for links and other users' folders
+            shutil.rmtree(path, ignore_errors=True)  # removes no links or other users' folders
         folder = parent / f"{prefix}{_owner()}"
         folder.mkdir(mode=0o700)
     except OSError as error:
@@ -90,35 +93,39 @@ def _clear(folder: Path) -> None:
 
 
 def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
-    """List files and folders whose names match, and whose processes have ended."""
+    """List what matches `names` in a folder and was made by a process that has ended."""
     # `glob` finds nothing in a folder that is missing or cannot be listed.
     matches = [(path, names.fullmatch(path.name)) for path in folder.glob("*")]
     return [path for path, match in matches if match and _has_ended(path, **match.groupdict())]
 
 
 def _has_ended(path: Path, machine: str, process: str) -> bool:
-    """Return whether a process has ended. On another machine, it counts as ended after a day."""
+    """Return whether the process that made a file or folder has ended.
+
+    A process on another machine, or on Windows, cannot be checked. It counts as ended if the file
+    is older than `ABANDONED_S`.
+    """
     try:
         if machine != _machine() or os.name != "posix":
             return time.time() - path.lstat().st_mtime > ABANDONED_S
-        os.kill(int(process), 0)  # sends no signal, only checks
-        # In a container without init, the workers of a killed process stay as zombies.
+        os.kill(int(process), 0)  # only checks that the process exists
+        # In a container without init, workers of a killed process remain as zombies (state Z).
         state = Path(f"/proc/{process}/stat")
         return state.is_file() and state.read_text().rpartition(")")[2].split()[0] == "Z"
     except ProcessLookupError:
         return True
-    except (OSError, OverflowError):  # another user's process, or the file is gone
+    except (OSError, OverflowError):  # it is another user's, or the file is gone
         return False
 
 
 def _owner() -> str:
-    """Return the part of a temporary name that identifies this process; new each time."""
+    """Return the owner for a new temporary name: this machine, this process, a random number."""
     return f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 @lru_cache
 def _machine() -> str:
-    """Return a digest of this boot and container, within which process numbers are unique."""
+    """Return a digest of the machine's boot and container, in which process numbers are unique."""
     parts = [platform.node()]
     with contextlib.suppress(OSError):  # Linux only
         parts += [Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")]

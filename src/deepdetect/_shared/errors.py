@@ -8,12 +8,12 @@ from contextlib import contextmanager
 
 
 class DeepDetectError(Exception):
-    """An error that the user can fix: one sentence says what is wrong and what to do.
+    """An error that the user can fix: its message says what is wrong and what to do.
 
-    The classes below also inherit from the matching built-in error: `ValueError` for a wrong
+    Most subclasses also inherit from the matching built-in error: `ValueError` for a wrong
     argument or wrong contents of a file, `FileNotFoundError` for a missing file, `ImportError` for
-    a missing package. The command line prints the sentence without a traceback and ends with exit
-    code 2.
+    a missing package. The command line prints the message without a traceback and ends with exit
+    code 2, unless the subclass says otherwise.
     """
 
 
@@ -40,7 +40,7 @@ class ReconstructionError(DeepDetectError, ValueError):
 
 
 class NoDepthError(ReconstructionError):
-    """The images show no depth, or do not overlap, although the options are right.
+    """The options are valid, but the images show no depth or do not overlap.
 
     The command line ends with exit code 3.
     """
@@ -51,7 +51,7 @@ class MissingExtraError(DeepDetectError, ImportError):
 
 
 class RegistrationError(DeepDetectError, ValueError):
-    """No trustworthy homography between images is found, or none that can warp them."""
+    """No homography between the images can be trusted, or the trusted one cannot warp them."""
 
 
 class MissingFileError(DeepDetectError, FileNotFoundError):
@@ -63,15 +63,15 @@ class MissingImageError(ImageError, MissingFileError):
 
 
 class MissingWeightsError(WeightsError, MissingFileError):
-    """A file of weights is missing."""
+    """A weights file is missing."""
 
 
 class MissingCalibrationError(ReconstructionError, MissingFileError):
-    """A file of cameras is missing."""
+    """A calibration file is missing."""
 
 
 class InvalidFileError(DeepDetectError, ValueError):
-    """A file has other contents than it should."""
+    """A file is damaged, or is not of the expected kind. It is a `ValueError`."""
 
 
 class BatchError(DeepDetectError):
@@ -80,13 +80,13 @@ class BatchError(DeepDetectError):
     The command line lists them and ends with exit code 1.
 
     Args:
-        summary: number of failures, and what happened to the other files.
+        summary: how many files failed, and what happened to the others.
         failures: a sentence on each failure, with the name of the file.
     """
 
     def __init__(self, summary: str, failures: Iterable[str]) -> None:
         self.summary, self.failures = summary, tuple(failures)
-        super().__init__(f"{summary}; the first: {self.failures[0]}")
+        super().__init__(f"{summary}; the first failure: {self.failures[0]}")
 
     def __reduce__(self) -> tuple[type[BatchError], tuple[str, tuple[str, ...]]]:
         return type(self), (self.summary, self.failures)
@@ -98,7 +98,7 @@ def first_line(error: object) -> str:
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
-    """Return the error for an unknown name, which suggests the nearest known one."""
+    """Return an OptionError for an unknown name; it suggests the most similar known one."""
     import difflib
 
     names = list(known)
@@ -109,16 +109,16 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
 
 
 def check_name(kind: str, name: object, known: Collection[object]) -> None:
-    """Raise an OptionError for an unknown name; `kind` says what it names, such as "projection"."""
+    """Raise an OptionError if a name is unknown; `kind` is what it names, such as "projection"."""
     if name not in known:
         raise unknown_name(kind, name, map(str, known))
 
 
 WITHOUT_GPU = (
-    "without a GPU with the option --extra-index-url https://download.pytorch.org/whl/cpu, "
-    "which spares 6 GB"
+    "and if you have no GPU, add --extra-index-url https://download.pytorch.org/whl/cpu, "
+    "which saves 6 GB"
 )
-"""Advice for pip, which installs the build of torch for CUDA on Linux by default."""
+"""Advice for the installation of torch: on Linux, pip installs the large CUDA build by default."""
 
 DISTRIBUTIONS = {
     "hloc": "git+https://github.com/cvg/Hierarchical-Localization",
@@ -126,7 +126,7 @@ DISTRIBUTIONS = {
     "ray": "'ray[data]'",
     "skimage": "scikit-image",
 }
-"""Names on PyPI of modules that have another name there."""
+"""Arguments of `pip install` for modules that are not installed under their own names."""
 
 
 def install_command(*packages: str) -> str:
@@ -137,7 +137,7 @@ def install_command(*packages: str) -> str:
 
 
 def require_packages(what: str, *packages: str) -> None:
-    """Raise a MissingExtraError if one of the packages is not installed; `what` needs them."""
+    """Raise a MissingExtraError if one of the packages that `what` needs is not installed."""
     missing = [package for package in packages if importlib.util.find_spec(package) is None]
     if missing:
         names = ", ".join(missing)
@@ -149,7 +149,10 @@ def require_packages(what: str, *packages: str) -> None:
 
 @contextmanager
 def noted_failures(name: str, failures: list[str]) -> Iterator[None]:
-    """Note an error in the block that concerns one of many inputs; let others through."""
+    """If the block fails for the input `name`, note the error, so that other inputs are processed.
+
+    Errors that would affect all inputs, a missing package or wrong weights, are still raised.
+    """
     try:
         yield
     except (MissingExtraError, WeightsError):
@@ -170,5 +173,5 @@ for _error in (
     RegistrationError,
     WeightsError,
 ):
-    # Tracebacks and `pickle` name the module from which users import the error.
+    # Tracebacks and `pickle` then name the module from which users import the error.
     _error.__module__ = "deepdetect"

@@ -1,4 +1,4 @@
-"""Conversion of arrays and tensors of any usual layout and type to 8-bit RGB and to planes."""
+"""Conversion of arrays and tensors of any usual layout and type to RGB images."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ Channels = Literal["rgb", "bgr"]
 CHANNEL_COUNTS = (1, 3, 4)
 
 SENSOR_BITS = (8, 10, 12, 14, 16)
-"""Bit depths of sensors whose images are stored with 16 bits. The smallest depth that holds all
-values of an image is assumed."""
+"""Possible bit depths of sensors whose images are stored as uint16. The smallest depth that can
+hold all values of an image is assumed."""
 
 LITTLE_RANGE = 1 / 8
-"""There is a warning if the values of an image fill less than this share of their range. Chosen by
-hand."""
+"""An image whose largest value is less than this fraction of white causes a warning, because it is
+nearly black. Chosen by hand."""
 
 
 def check_channels(channels: str) -> None:
-    """Raise an OptionError for an unknown order of the colours of an array."""
+    """Raise an OptionError if the channel order is neither "rgb" nor "bgr"."""
     check_name("channel order", channels, ("rgb", "bgr"))
 
 
 def as_array(image: Any) -> np.ndarray:
-    """Return an array-like, or a PyTorch tensor of any device, as an array.
+    """Return an array-like, or a PyTorch tensor on any device, as a NumPy array.
 
     Raises:
-        ImageError: the value is None or an iterator, or its rows differ in length.
+        ImageError: the value is None, an iterator, a sparse or meta tensor, or a list of rows of
+            different lengths.
     """
     if image is None:
         raise ImageError("the image is None, as `cv2.imread` returns for a missing file: check it")
@@ -39,7 +40,7 @@ def as_array(image: Any) -> np.ndarray:
         raise ImageError("the image is an iterator: give one image, or a list to `detect_batch`")
     if hasattr(image, "detach") and hasattr(image, "cpu"):  # a tensor
         if image.is_meta or str(image.layout) != "torch.strided":
-            raise ImageError("a tensor on the device meta, or a sparse one, is not an image")
+            raise ImageError("a sparse tensor, or one on the device 'meta', is not an image")
         image = image.detach().cpu()
         if image.is_floating_point():
             image = image.float()  # NumPy has no bfloat16
@@ -59,13 +60,14 @@ def array_to_rgb(
     white: int | None = None,
     deep: bool = False,
 ) -> np.ndarray:
-    """Convert an array or PyTorch tensor, as in `load_image`, to an (H, W, 3) RGB image.
+    """Convert an array or PyTorch tensor to an (H, W, 3) RGB image.
 
-    The result is uint8 or, if `deep` and the input is not uint8, uint16. `white` is the 16-bit
-    value of white, if known; `name` is used in messages.
+    The result is uint8 or, if `deep` is set and the input has more than 8 bits, uint16. `white` is
+    the value of white in an unsigned image, if known. `name` is the image's name in messages. The
+    other arguments are as in `load_image`.
 
     Raises:
-        ImageError: the image has another shape, type or range, or holds NaN.
+        ImageError: the image has an unsupported shape, type or range, or contains NaN.
         OptionError: the order of the channels is unknown.
     """
     check_channels(channels)
@@ -84,7 +86,7 @@ def array_to_rgb(
 
 
 def deep_values(image: Any) -> np.ndarray:
-    """Return the values of a PIL image of mode I or F, in the type of its file."""
+    """Return the values of a PIL image of mode I or F; integers of a PNG or PPM become uint16."""
     values = np.asarray(image)
     of_16_bits = image.mode == "I" and image.format in ("PNG", "PPM")
     return values.astype(np.uint16) if of_16_bits else values
@@ -96,7 +98,10 @@ def to_8_bits(rgb: np.ndarray) -> np.ndarray:
 
 
 def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
-    """Write (H, W, 3) pixels into larger (3, H', W') planes; repeat the last row and column."""
+    """Write (H, W, 3) uint8 pixels, scaled to [0, 1], into float planes (3, H', W').
+
+    If the planes are larger than the image, its last row and column are repeated.
+    """
     below, right = planes.shape[1] - rgb.shape[0], planes.shape[2] - rgb.shape[1]
     if below or right:
         rgb = np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
@@ -104,7 +109,7 @@ def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
 
 
 def srgb_to_linear() -> np.ndarray:
-    """Return the linear intensity in [0, 1] of the 256 levels of sRGB (IEC 61966-2-1)."""
+    """Return the linear intensities in [0, 1], shape (256,), of the sRGB levels (IEC 61966-2-1)."""
     value = np.arange(256) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
@@ -129,7 +134,10 @@ def _channels_last(array: np.ndarray) -> np.ndarray:
 
 
 def _select_bands(array: np.ndarray, bands: Sequence[int], name: str) -> np.ndarray:
-    """Select bands, numbered from 1, along the shorter of the first and the last axis."""
+    """Return the chosen bands, whose numbers start at 1, as an array (H, W, bands).
+
+    In `array`, the axis of the bands is the shorter one of the first and the last axis.
+    """
     if array.ndim == 3 and array.shape[0] < array.shape[2]:
         array = np.moveaxis(array, 0, 2)
     if array.ndim != 3 or max(bands) > array.shape[2]:
@@ -139,7 +147,7 @@ def _select_bands(array: np.ndarray, bands: Sequence[int], name: str) -> np.ndar
 
 
 def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, float]:
-    """Return the values of black and white."""
+    """Return the values that mean black and white in an image of this type."""
     kind, size = array.dtype.kind, array.dtype.itemsize
     if kind == "b":
         return 0, 1
@@ -171,7 +179,7 @@ def _tell_if_dark(used: float, name: str) -> None:
 
 
 def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
-    """Scale values linearly, so that the first of the range becomes black and the second white."""
+    """Scale to uint8 or uint16; `value_range` gives the values that become black and white."""
     (low, high), size = value_range, array.dtype.itemsize
     if array.dtype == np.uint8 and (low, high) == (0, 255):
         return array
@@ -186,6 +194,6 @@ def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: 
     if array.dtype.kind == "u" and size <= 2:
         return levels(np.arange(256**size))[array]
     found = np.empty(array.shape, kind)
-    for row, values in enumerate(array):  # row by row, because copies of an image are large
+    for row, values in enumerate(array):  # row by row, because a float64 image is large
         found[row] = levels(values)
     return found

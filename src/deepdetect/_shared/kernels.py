@@ -1,7 +1,7 @@
-"""Compilation of kernels by numba, at the first call of each.
+"""Compilation of kernels by numba: each is compiled at its first call and cached on disk.
 
-If numba cannot write to its usual cache folders, as in a read-only container, the cache is in a
-folder of this user in the temporary directory. If this fails, nothing is cached.
+If numba cannot write to its usual cache folders, as in a read-only container, it uses a private
+folder of this user in the temporary directory. If that folder cannot be made, nothing is cached.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _announcement: list[Callable[[], object]] = []
 
 
 def announce_compilation(tell: Callable[[], object]) -> None:
-    """Set a function to be called once, before the first kernel that is not in the cache."""
+    """Let `tell` be called once, before the first compilation of a kernel that is not cached."""
     _announcement[:] = [tell]
 
 
 @functools.cache
 def _listen() -> None:
-    """Register for numba's event of a compilation, which does not occur for a cached kernel."""
+    """Call the announcement at numba's first compilation; loading a cached kernel is not one."""
     from numba.core import event as events
 
     class Listener(events.Listener):
@@ -55,14 +55,14 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
         ) from None
     if _announcement:
         _listen()
-    config: Any = numba.config  # type checkers do not know its names
+    config: Any = numba.config  # type checkers do not know its settings
 
     def decorate(function: Callable[..., Any]) -> Any:
         with suppress(RuntimeError):  # numba found no writable folder
             return numba.njit(cache=True, **flags)(function)
         before = config.CACHE_DIR
         try:
-            # Numba reads the setting while a function is decorated, not when it is called.
+            # Numba reads `CACHE_DIR` while a function is decorated, not when it is called.
             config.CACHE_DIR = str(_temporary_folder())
             return numba.njit(cache=True, **flags)(function)
         except (AttributeError, OSError, RuntimeError):  # AttributeError: Windows lacks `getuid`

@@ -1,7 +1,8 @@
 """Processors and memory of this machine: parallel work, and how much memory is free.
 
-joblib is not used, because its workers finish their task when the parent is killed. Modules that
-start processes are imported late: they take a tenth of the time and memory of loading a detector.
+joblib is not used, because its workers finish their task even if the parent is killed. The modules
+that start processes are imported only when needed, because importing them takes a tenth of the time
+and memory that loading a detector takes.
 """
 
 from __future__ import annotations
@@ -31,37 +32,39 @@ Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
 PARTS_PER_THREAD = 4
-"""Average number of parts per thread. A thread whose parts are easy takes more of them."""
+"""`parallel_for` divides a range into this many parts per thread, so that a thread that is done
+early can take more of them."""
 
 TASKS_PER_WORKER = 8
-"""`map_in_processes` submits this number of tasks per worker ahead, so that the others stay busy
-while it waits for the outcome of the first. Chosen by hand."""
+"""`map_in_processes` submits this number of tasks per worker ahead, so that all workers stay busy
+while it waits for the outcome of the oldest task. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""Seconds that a running task has to end after the work was interrupted or failed, before it is
-killed."""
+"""When the work is interrupted or fails, running tasks have this many seconds to end before their
+processes are killed."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables from which libraries take their number of threads when they are loaded."""
 
 BYTES_PER = {
-    # Descriptors, and the search trees of a matcher.
+    # The descriptor of a keypoint, and its part of a matcher's search trees.
     "matched_keypoint": 1500,
-    # Blending of a panorama: a pixel of the canvas, and of the box of one image on it.
+    # Blending a panorama: a pixel of its canvas, and one of the largest image warped onto it.
     "canvas_pixel": 34,
     "blended_pixel": 30,
-    # Two maps of float32, and arrays derived from them.
+    # A pixel of a scale-space level: two float32 maps, and arrays derived from them.
     "pixel_of_level": 16,
-    # Peak of dense matching.
+    # Peaks of dense matching, and of the fusion of depth maps.
     "dense_pixel": 250,
     "fused_pixel": 500,
 }
-"""Bytes of memory per item, as measured; `needed_memory` adds them up."""
+"""Measured bytes of memory that each item needs; `needed_memory` multiplies them by counts."""
 
 DEFAULT_MEMORY = 4_000_000_000
-"""Bytes assumed to be available if the system does not tell."""
+"""Bytes of memory assumed to be available if the system does not report them."""
 
-# M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no mappings, no trimming, larger growth.
+# M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no block is mapped on its own, and the
+# heap is never trimmed and grows by 256 MB.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
 _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
 
@@ -69,7 +72,7 @@ _max_threads: int | None = None
 """`parallel_for` uses at most this number of threads in this process; None: one per processor."""
 
 _chosen = threading.local()
-"""Number of threads that a caller has chosen for the duration of a call."""
+"""Its attribute `threads` is what `limited_threads` has set in the current thread."""
 
 
 TaskMap = Callable[..., Iterator[Any]]
@@ -86,7 +89,7 @@ def processor_count() -> int:
 def map_in_processes(
     function: Callable[[Task], Outcome], tasks: Sequence[Task], workers: int | None = None
 ) -> Iterator[Outcome]:
-    """Apply a module-level function to every task, in several processes.
+    """Apply a module-level function to every task, in several processes; yield the outcomes.
 
     Outcomes are in the order of the tasks. With one worker, the work is done in this process.
 
@@ -96,7 +99,7 @@ def map_in_processes(
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")
-    most = 61 if os.name == "nt" else len(tasks)  # Windows cannot wait for more processes
+    most = 61 if os.name == "nt" else len(tasks)  # Windows cannot wait for more than 61 processes
     count = min(workers or processor_count(), most, len(tasks))
     if count <= 1:
         with one_opencv_thread():
@@ -106,7 +109,7 @@ def map_in_processes(
     from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
 
-    # A forked process would copy the locks of the parent's threads.
+    # A forked process would copy locks held by the parent's threads, and wait for them forever.
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     remaining = iter(tasks)
@@ -114,7 +117,7 @@ def map_in_processes(
     pending: deque[Future[Outcome]] = deque()
 
     def submit(most: int) -> None:
-        # The first submissions start processes, which inherit the blocked signal and one thread.
+        # The processes start at the first submissions, with Ctrl-C deferred and one thread.
         with signals_held(), _one_thread_inherited():
             for task in islice(remaining, most):
                 pending.append(pool.submit(_run_task, function, task))
@@ -136,7 +139,7 @@ def map_in_processes(
 
 
 def _end_workers(pool: ProcessPoolExecutor) -> None:
-    """End tasks that are no longer needed: they clean up, or are killed after a while."""
+    """Let workers end and clean up; kill those that have not ended after `UNWANTED_TASK_S`."""
     workers = list((pool._processes or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
     for worker in workers:
@@ -149,7 +152,7 @@ def _end_workers(pool: ProcessPoolExecutor) -> None:
 
 @contextmanager
 def _one_thread_inherited() -> Iterator[None]:
-    """Let libraries in new processes use one thread, unless the user has set a number."""
+    """Start processes in the block with one thread per library, unless the user set a number."""
     unset = [name for name in _THREAD_VARIABLES if name not in os.environ]
     os.environ.update(dict.fromkeys(unset, "1"))
     try:
@@ -163,7 +166,7 @@ def _run_task(function: Callable[[Task], Outcome], task: Task) -> Outcome:
     try:
         end_worker_by_signals()
         return function(task)
-    except SystemExit:  # else the pool would run the next task
+    except SystemExit:  # otherwise the process would run the next task
         os._exit(1)
 
 
@@ -173,7 +176,7 @@ def _start_worker() -> None:
 
 
 def start_child() -> None:
-    """Prepare a new process: it uses one thread, and ends with its parent."""
+    """Let a new process use one thread, and end with its parent or by Ctrl-C."""
     end_by_interrupt()
     use_one_thread()
     end_with_parent()
@@ -188,7 +191,7 @@ def use_one_thread() -> None:
 
 @contextmanager
 def limited_threads(threads: int | None) -> Iterator[None]:
-    """Limit the threads used by calls from this thread while the block runs; None: no limit."""
+    """Limit the threads of calls that this thread makes in the block; None: no new limit."""
     before = getattr(_chosen, "threads", None)
     _chosen.threads = threads or before
     try:
@@ -198,14 +201,15 @@ def limited_threads(threads: int | None) -> Iterator[None]:
 
 
 def thread_limit() -> int | None:
-    """Return how many threads this process may use, or None for a library's own number.
+    """Return how many threads this process may use, or None to let each library decide.
 
-    OMP_NUM_THREADS is respected. Worker processes, and processes that may not use all processors,
-    get a number: by default ONNX Runtime binds threads to the same processors in every process.
+    OMP_NUM_THREADS is respected. Child processes, and processes that may not use all processors,
+    always get a number, because by default ONNX Runtime binds its threads to the same processors
+    in every process.
     """
     if chosen := getattr(_chosen, "threads", None):
         return int(chosen)
-    # A process that multiprocessing started has loaded the module; others need not import it.
+    # A process started by multiprocessing has loaded this module; others need not import it.
     parent_of = getattr(sys.modules.get("multiprocessing.process"), "parent_process", None)
     wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     if _max_threads is None and wished.isdecimal() and int(wished):
@@ -218,7 +222,7 @@ def thread_limit() -> int | None:
 
 
 def end_with_parent(end: Callable[[], object] = lambda: None) -> None:
-    """End this process when its parent has ended, after a last call of `end`."""
+    """End this process when its parent has ended; call `end` just before."""
     import multiprocessing
 
     def wait(parent: BaseProcess) -> None:
@@ -242,10 +246,10 @@ def one_opencv_thread() -> Iterator[None]:
 
 
 def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> None:
-    """Call `work(start, stop, *arguments)` for parts of a range, in a thread for each processor.
+    """Call `work(start, stop, *arguments)` for parts of range(count), with a thread per processor.
 
-    `work` should release the GIL, and its result must not depend on how the range is divided. A
-    worker of `map_in_processes` uses one thread.
+    `work` should release the GIL, and its result must not depend on how the range is divided. In a
+    worker process of `map_in_processes`, there is only one thread.
     """
     threads = min(thread_limit() or processor_count(), count)
     if threads <= 1:
@@ -261,17 +265,17 @@ def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> No
 
 
 def available_memory() -> int:
-    """Return the bytes that are available without swapping, within the container's limit."""
+    """Return the bytes of memory available without swapping, within the container's limit."""
     return min(_system_memory(), _container_memory())
 
 
 def needed_memory(**counts: float) -> float:
-    """Return the bytes that a step needs for `counts` of items, named as in `BYTES_PER`."""
+    """Return the bytes that a step needs; `counts` are numbers of items named as in `BYTES_PER`."""
     return sum(BYTES_PER[name] * count for name, count in counts.items())
 
 
 def require_memory(what: str, advice: str, **counts: float) -> None:
-    """Check that a step does not exceed the memory; `counts` are as in `needed_memory`.
+    """Check that a step fits in the available memory; `counts` are as in `needed_memory`.
 
     Raises:
         OptionError: the step needs more memory than is available.
@@ -286,8 +290,9 @@ def require_memory(what: str, advice: str, **counts: float) -> None:
 def disable_malloc_trim() -> None:
     """Let this process keep the memory that it frees, if the C library is glibc.
 
-    By default glibc returns large blocks to the system at once, which then clears each page of new
-    ones. This takes a fifth of the time of a training step on the CPU, and a sixth of labelling.
+    By default, glibc returns large freed blocks to the system at once, and the system clears each
+    page of new blocks. Clearing takes a fifth of the time of a training step on the CPU, and a
+    sixth of the time of labelling.
     """
     if platform.libc_ver()[0] == "glibc":
         for option, value in _MALLOPT:
@@ -295,10 +300,10 @@ def disable_malloc_trim() -> None:
 
 
 def release_freed_memory() -> None:
-    """Return freed memory to the system now, and blocks of a megabyte or more from now on.
+    """Return all freed memory to the system, and from now on each freed block over a megabyte.
 
-    By default, glibc keeps blocks of up to 32 MB, so that a network leaves hundreds of megabytes
-    behind. The setting is for the whole process.
+    By default, glibc keeps freed blocks of up to 32 MB for itself: hundreds of megabytes after a
+    network has run. The setting applies to the whole process.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
@@ -308,7 +313,7 @@ def release_freed_memory() -> None:
 
 def _system_memory() -> int:
     # MemAvailable includes caches that the system can drop.
-    with suppress(OSError, StopIteration):  # macOS does not have this file
+    with suppress(OSError, StopIteration):  # macOS lacks /proc/meminfo
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvail"))
     with suppress(AttributeError, ValueError):  # Windows
@@ -317,7 +322,7 @@ def _system_memory() -> int:
 
 
 def _container_memory() -> int:
-    """Return the bytes that the control group (version 2) of a container leaves to this process."""
+    """Return the free bytes below the limit of the container (cgroup v2), or 2**62 without one."""
     group = Path("/sys/fs/cgroup")
     with suppress(OSError, ValueError, KeyError):  # no control group, or its limit is "max"
         limit, used, stat = (

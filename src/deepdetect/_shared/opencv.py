@@ -1,7 +1,7 @@
-"""OpenCV, imported at its first use, from any of its packages.
+"""OpenCV, imported at its first use, from whichever of its PyPI packages is installed.
 
-All of these install into one folder `cv2`, later ones over earlier ones. Modules write
-`from .._shared.opencv import cv2`.
+These packages share one folder `cv2`: a package overwrites the files of one installed before. The
+modules of DeepDetect write `from .._shared.opencv import cv2`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from .errors import MissingExtraError, first_line, require_packages
 from .signals import sigterm_kept
 
-LOWEST_VERSION = "4.13"
-"""Lowest supported version: 4.12 writes images without their ICC profiles, and says nothing."""
+LOWEST_VERSION = "4.12"
+"""Lowest supported version of OpenCV: older ones cannot write EXIF data into an image."""
 
 DISTRIBUTIONS = (
     "opencv-python",
@@ -60,8 +60,8 @@ def import_opencv() -> ModuleType:
     version = getattr(found, "__version__", None)
     if version is None:  # the removal of a package has left a folder `cv2` behind
         raise MissingExtraError(
-            "the folder cv2 of the installed OpenCV is incomplete, as after the removal of another "
-            "package of OpenCV: run pip install --force-reinstall opencv-python-headless"
+            "the folder cv2 of the installed OpenCV is incomplete, perhaps because another package "
+            "of OpenCV was removed: run pip install --force-reinstall opencv-python-headless"
         )
     if version_numbers(version) < version_numbers(LOWEST_VERSION):
         raise MissingExtraError(
@@ -78,22 +78,22 @@ def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
     """
     import_opencv()
     require_packages(purpose, "pycolmap", "h5py")
-    with sigterm_kept():  # pycolmap's handler would print a stack trace
+    with sigterm_kept():  # pycolmap sets a handler that prints a stack trace
         import pycolmap
     return pycolmap
 
 
 def is_lack_of_memory(error: Exception) -> bool:
-    """Return whether an exception is OpenCV's for lack of memory, without importing OpenCV."""
+    """Return whether OpenCV raised this error for lack of memory; do not import it to find out."""
     loaded = sys.modules.get("cv2")
     wanted = loaded is not None and isinstance(error, loaded.error)
     return wanted and getattr(error, "code", None) == cv2.Error.StsNoMem
 
 
 def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
-    """Return a factory of OpenCV, such as "AgastFeatureDetector_create".
+    """Return a factory function of OpenCV, such as "AgastFeatureDetector_create".
 
-    Version 5 moved some of them from `cv2` to `cv2.xfeatures2d`, one of the contrib modules.
+    OpenCV 5 moved some of them from `cv2` to `cv2.xfeatures2d`, one of the contrib modules.
 
     Raises:
         MissingExtraError: the factory is in the contrib modules, which are not installed.
@@ -113,12 +113,12 @@ def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
 
 def installed_distributions() -> list[str]:
     """Return the installed packages that contain `cv2`."""
-    import importlib.metadata  # this import takes longer than that of this package
+    import importlib.metadata  # late: it takes longer than importing DeepDetect
 
     installed = {each.name for each in importlib.metadata.distributions()}
     return [name for name in DISTRIBUTIONS if name in installed]
 
 
 def version_numbers(version: str) -> list[int]:
-    """Return the numbers of a version, by which versions are compared."""
+    """Return the numbers in a version string, for comparing versions."""
     return [int(part) for part in re.findall(r"\d+", version)]

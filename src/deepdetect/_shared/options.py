@@ -29,9 +29,10 @@ def suggest_keywords(
 ) -> Callable[Parameters, Result]:
     """Decorate a function so that an unknown keyword raises an error that suggests a known one.
 
-    An argument of a wrong type also raises an error, if its annotation consists of simple types.
-    The function keeps its signature; a class, decorated above `dataclass`, stays the same class.
-    `elsewhere` maps keywords of other functions to advice on what to do instead.
+    An argument of a wrong type also raises an error, if its annotation consists only of types in
+    `ACCEPTED` or dataclasses. The function keeps its signature. A class is decorated above
+    `@dataclass`, and stays the same class. `elsewhere` maps keywords that only other functions have
+    to advice on what to do instead.
     """
     if isinstance(function, type):
         kind: Any = function
@@ -57,13 +58,13 @@ def suggest_keywords(
 
 
 def shown(value: object) -> str:
-    """Return a value for an error message, short and on one line."""
+    """Return the text of a value for an error message, short and on one line."""
     return " ".join(reprlib.repr(value).split())
 
 
 ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     bool: (bool, np.bool_),
-    int: (Real,),  # `check_ranges` tests for whole numbers
+    int: (Real,),  # `check_ranges` checks that they are whole
     float: (Real,),
     str: (str,),
     Path: (os.PathLike,),
@@ -71,19 +72,19 @@ ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     Callable: (Callable,),
     Mapping: (Mapping,),
 }
-"""Types that are accepted for an annotation, including those of NumPy."""
+"""The types that a value may have, by the type in the annotation; NumPy's types are included."""
 MADE_LATER = type(functools.cache(len))
-"""Type of cached functions. Such a function is accepted in place of keypoints, which it then makes
-at first use."""
+"""Type of functions decorated with `functools.cache`. Such a function is accepted in place of an
+object, for example keypoints, which it makes at the first use."""
 KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable, Mapping: Mapping}
 
 
 @functools.cache
 def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
-    """Return the accepted types of those arguments whose annotations consist of simple types."""
+    """Return the accepted types of each argument whose annotation consists of simple types."""
     try:
         hints = typing.get_type_hints(function)
-    except NameError:  # a type is only imported for type checkers
+    except NameError:  # a type that only type checkers import
         return {}
     found = {}
     for name, hint in hints.items():
@@ -96,10 +97,12 @@ def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
 
 
 def numbers_of(name: str, value: Any, kind: type | None, columns: int | None = None) -> np.ndarray:
-    """Return numbers as an array of a data type (None: unchanged), in rows of `columns` if given.
+    """Return numbers as an array of the type `kind`, or of their own type if it is None.
+
+    If `columns` is given, the array is two-dimensional with this number of columns.
 
     Raises:
-        OptionError: the value is not numeric, or has another shape.
+        OptionError: the value is not numeric, or its numbers do not fill whole rows.
     """
     try:
         found: np.ndarray = np.asarray(value, kind)
@@ -110,15 +113,16 @@ def numbers_of(name: str, value: Any, kind: type | None, columns: int | None = N
 
 
 def whole(name: str, value: Any) -> int:
-    """Return a whole number from 0 on, or raise an OptionError."""
+    """Return a number as an int, or raise an OptionError if it is negative or not whole."""
     number: Any = value if isinstance(value, Real) else -1
     if number < 0 or not float(number).is_integer():
-        raise OptionError(f"`{name}` must be a whole number from 0 on, not {shown(value)}")
+        raise OptionError(f"`{name}` must be a whole number of at least 0, not {shown(value)}")
     return int(number)
 
 
 LARGEST = 1e38
-"""Limit of options that must be finite, so that they are also finite in float32."""
+"""Options that must be above 0, or at least 0, may not exceed this, so that they are finite in
+float32."""
 
 
 def check_ranges(
@@ -130,10 +134,11 @@ def check_ranges(
     counts: Sequence[str] = (),
     between: Mapping[str, tuple[float, float]] = {},
 ) -> None:
-    """Check the numbers in fields of options, also those in tuples; None always passes.
+    """Check the numbers in the fields of `options`, including those in tuples; None always passes.
 
-    The arguments name the fields that must be above 0, at least 0, in [0, 1], whole numbers from 1
-    on, or between two limits. If the default of a field is an int, its value must be whole.
+    Each argument names fields: those that must be above 0 (`positive`), at least 0
+    (`not_negative`), in [0, 1] (`fractions`), whole numbers of at least 1 (`counts`), or between
+    two limits (`between`). If the default of a field is an int, its value must be whole.
 
     Raises:
         OptionError: a value is not a number, or out of its range.
@@ -141,7 +146,7 @@ def check_ranges(
     bounds = [(name, math.ulp(0), LARGEST, "be above 0") for name in positive]
     bounds += [(name, 0, LARGEST, "be 0 or more") for name in not_negative]
     bounds += [(name, 0, 1, "lie in [0, 1]") for name in fractions]
-    bounds += [(name, 1, math.inf, "be a whole number from 1 on") for name in counts]
+    bounds += [(name, 1, math.inf, "be a whole number of at least 1") for name in counts]
     for name, (smallest, largest) in between.items():
         limits = f"lie in [{smallest:.12g}, {largest:.12g}]"
         expected = f"be at least {smallest:.12g}" if largest == math.inf else limits

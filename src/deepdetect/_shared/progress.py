@@ -11,7 +11,7 @@ from typing import Any
 
 
 class _StandardError:
-    """The present standard error; if it is None, closed or full, nothing is written."""
+    """A stream that writes to the current `sys.stderr`, unless that is None, closed or full."""
 
     encoding = "utf-8"
 
@@ -33,7 +33,7 @@ STDERR: Any = _StandardError()
 
 
 def fails(stream: Any) -> bool:
-    """Return whether a stream has a full disk or broken pipe; if so, discard further output."""
+    """Return whether writing to a stream fails (full disk, broken pipe); if so, discard output."""
     if stream is None:
         return False
     try:
@@ -45,7 +45,7 @@ def fails(stream: Any) -> bool:
 
 
 def progress(total: int | None, title: str, unit: str, quiet: bool = False, done: int = 0) -> Any:
-    """Return a tqdm bar on standard error, which begins with `done` units."""
+    """Return a tqdm progress bar on standard error that starts with `done` of `total` units."""
     from tqdm import tqdm
 
     return tqdm(
@@ -64,9 +64,9 @@ def progress(total: int | None, title: str, unit: str, quiet: bool = False, done
 def stage_progress(
     title: str, stages: Sequence[str] = (), quiet: bool = False
 ) -> Iterator[Callable[[str], None]]:
-    """Show a bar of stages; yield a function to call with the name of each stage when it ends.
+    """Show a progress bar of stages; yield a function to call with a stage's name when it ends.
 
-    The bar shows the running stage or, without a list, the last one that ended.
+    The bar names the running stage or, if `stages` is empty, the last one that ended.
     """
     # The bar appears only on a terminal, so that logs stay readable.
     quiet = quiet or not STDERR.isatty()
@@ -81,7 +81,7 @@ def stage_progress(
 
 
 def say(text: str) -> None:
-    """Write a line to standard error, above a bar if there is one."""
+    """Write a line to standard error, above the progress bar if there is one."""
     from tqdm import tqdm
 
     tqdm.write(text, file=STDERR)
@@ -105,7 +105,7 @@ class StageTimer:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Measure the block as the stage of this name."""
+        """Add the time of the block to the stage of this name, then report the stage."""
         started = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started

@@ -1,6 +1,7 @@
-"""Records of outputs: their inputs and options, whether they are complete or may be replaced.
+"""Records of output files: their inputs and options, and whether they are complete.
 
-The record of an output is `.deepdetect/NAME.json` in its folder.
+A record tells whether work can be skipped, and whether its outputs may be replaced. The record of
+an output NAME is `.deepdetect/NAME.json` in the same folder.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ ADVICE = "choose another place with -o, or replace it with --overwrite"
 def key(*values: Any) -> str:
     """Return a digest of values, 32 hexadecimal digits that are the same on every machine.
 
-    Values are None, booleans, numbers, text, bytes, arrays (by type, shape and content), paths (by
-    the content of their files), dataclasses (by name and fields), lists or tuples, sets and dicts.
+    Values may be None, booleans, numbers, text, bytes, lists, tuples, sets and dicts. Arrays count
+    with type, shape and content, paths with the content of their files, and dataclasses with their
+    names and fields.
 
     Raises:
         MissingFileError: a file is missing.
@@ -42,7 +44,7 @@ def key(*values: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON would restore it; arrays and files become digests. See `key`."""
+    """Return a value as JSON restores it, with digests for bytes, arrays and files. See `key`."""
     match value:
         case None | bool() | int() | float() | str():
             return value
@@ -69,7 +71,7 @@ def plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file; a process reads it again only if it has changed.
+    """Return the SHA-256 of a file, cached in this process until the file's size or time changes.
 
     Raises:
         MissingFileError: the file cannot be read.
@@ -87,7 +89,7 @@ def _file_digest(path: Path, size: int, changed: int) -> str:
 
 
 def file_state(path: Path) -> tuple[int, int]:
-    """Return the size of a file in bytes and the time of its last change in ns, or zeros."""
+    """Return a file's size in bytes and its time of change in ns, or zeros if it is missing."""
     try:
         status = path.stat()
     except OSError:
@@ -96,10 +98,12 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def check_same(place: Path, before: object, now: Mapping[str, Any], advice: str = ADVICE) -> None:
-    """Compare the settings of an existing output with those of this run, both as from `plain`.
+    """Check that an existing output was made with the same settings as those of this run.
+
+    `before` are the settings of the output, `now` those of this run, both as `plain` returns them.
 
     Raises:
-        OptionError: some settings differ (it names them), or the output has no settings.
+        OptionError: settings differ, which the message names, or the output has no settings.
     """
     if not isinstance(before, Mapping):
         raise OptionError(f"{place} exists, written by another program: {advice}")
@@ -116,9 +120,9 @@ class Outputs:
     Attributes:
         paths: output files or folders.
         inputs: input files or folders.
-        settings: other values that outputs depend on, as for `key`.
+        settings: other values on which the outputs depend, of the types that `key` accepts.
         overwrite: replace any existing output.
-        growing: also replace outputs of a part of the inputs.
+        growing: outputs that were made from only some of the inputs may also be replaced.
 
     Example:
         >>> import tempfile
@@ -138,17 +142,17 @@ class Outputs:
     growing: bool = False
 
     def check(self) -> None:
-        """Check before long work that existing outputs may be replaced.
+        """Check that this work may replace the existing outputs; call it before long work.
 
         Raises:
-            OptionError: an output has other inputs or settings, or no record.
+            OptionError: an existing output has other inputs or settings, or no record.
         """
         if not self.overwrite:
             for path in self.paths:
                 self._known(path)
 
     def find(self) -> dict[str, Any] | None:
-        """Return the values noted with complete outputs, or None if there is work to do.
+        """Return the values noted with the outputs if all are complete and up to date, else None.
 
         Raises:
             OptionError: `check` fails, or an output was changed after it was made.
@@ -158,17 +162,17 @@ class Outputs:
         records = [self._known(path) for path in self.paths]
         for path, record in zip(self.paths, records, strict=True):
             if record and record["digest"] and not _is_unchanged(path, record):
-                raise OptionError(f"{path} exists, and was changed: {ADVICE}")
+                raise OptionError(f"{path} exists, and was changed after it was made: {ADVICE}")
         states = [list(file_state(path)) for path in self.inputs]
         done = all(record and record["whole"] and record["states"] == states for record in records)
         return records[0]["values"] if done and records[0] else None
 
     @contextmanager
     def writing(self) -> Iterator[dict[str, Any]]:
-        """Write the records before and after the work; yield a dictionary of values to note.
+        """Write the records before and after the block; yield a dictionary for values to note.
 
-        If the work fails, outputs that it did not replace keep their former records. If it is
-        killed, the outputs already have its records.
+        If the block fails, outputs that it did not replace get their former records back. If the
+        process is killed, the records already name this work, and call its outputs incomplete.
 
         Raises:
             OptionError: `check` fails.
@@ -196,14 +200,16 @@ class Outputs:
             raise
 
     def _known(self, path: Path) -> dict[str, Any] | None:
-        """Return the record of an output, or None without one; check that it may be replaced."""
+        """Return the record of an output that may be replaced, or None if there is no output."""
         if not path.exists():
             return None
         names = [str(each.resolve()) for each in self.inputs]
         record = _read(path)
         if record is None:
             origin = " and ".join(names)
-            raise OptionError(f"{path} exists, but has no record of {origin}: {ADVICE}")
+            raise OptionError(
+                f"{path} exists, but no record says that it was made from {origin}: {ADVICE}"
+            )
         before = record["inputs"]
         if before != names and not (self.growing and {*before} <= {*names}):
             raise OptionError(f"{path} exists, made from {' and '.join(before)}: {ADVICE}")
@@ -230,7 +236,7 @@ def _record(output: Path) -> Path:
 
 
 def _read(output: Path) -> dict[str, Any] | None:
-    """Read the record of an output; return None if it is missing or damaged."""
+    """Read the record of an output; return None if the record is missing or damaged."""
     try:
         record = json.loads(_record(output).read_bytes())
     except (OSError, ValueError):
@@ -249,25 +255,25 @@ def _restore(record: Path, content: bytes | None) -> None:
 
 
 def _is_unchanged(path: Path, record: Mapping[str, Any]) -> bool:
-    # A copy of the folder has other times, but the same digests.
+    # In a copied folder, files have other times but the same digests.
     return list(file_state(path)) == record["state"] or file_digest(path) == record["digest"]
 
 
 def inputs_of(path: Path) -> list[str]:
-    """Return the inputs of an output as resolved paths, or nothing for a file without record."""
+    """Return the inputs of an output as resolved paths, or an empty list if it has no record."""
     record = _read(path)
     return [] if record is None else list(record["inputs"])
 
 
 def was_made(path: Path, root: Path) -> bool:
-    """Return whether a file below a folder is an output, or lies in a folder that is one."""
+    """Return whether a file below `root` is a recorded output, or lies in a folder that is one."""
     return path != root and (_record(path).is_file() or was_made(path.parent, root))
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Any], *, compress: bool = True) -> None:
-    """Write arrays by name to an NPZ file, whole or not at all."""
-    # At level 1 coordinates of dense points shrink to a tenth. NumPy's level takes five times as
-    # long, and saves only another twentieth.
+    """Write named arrays to an NPZ file, which appears complete or not at all."""
+    # Level 1 compresses coordinates of dense keypoints to 28% of their size. NumPy's level 6 takes
+    # eight times as long, and reaches only 24%.
     method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
     with (
         atomic_path(path) as temporary,
@@ -279,7 +285,7 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Any], *, compress: bool =
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """Read the arrays of `save_arrays`; return None if the file is missing or damaged."""
+    """Read arrays that `save_arrays` wrote; return None if the file is missing or damaged."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             return dict(file)
@@ -289,7 +295,9 @@ def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
 
 @contextmanager
 def lock(path: Path, final: Path) -> Iterator[None]:
-    """Let only one process at a time write a file, by a lock file; on Windows nothing is locked.
+    """Hold the lock file `path`, so that only one process at a time writes `final`.
+
+    On Windows, and in network folders without locks, nothing is locked.
 
     Raises:
         OptionError: another process holds the lock.

@@ -26,17 +26,18 @@ def import_onnxruntime() -> ModuleType:
 
 def import_openvino() -> ModuleType:
     """Import OpenVINO as if the optional openvino_telemetry were not installed."""
-    # The only variable that turns telemetry off is CI, which other packages also read.
+    # Only the variable CI turns its telemetry off. It is not set, as other packages also read it.
     return _import_with("openvino", sys.modules, "openvino_telemetry", None)
 
 
 def _import_with(
     package: str, entries: MutableMapping[str, Any], key: str, value: object
 ) -> ModuleType:
-    """Import a package while an entry has a value; then restore the entry.
+    """Import a package while `entries[key]` has this value; then restore the entry.
 
-    Both packages start telemetry when they are imported: they write an identifier into the home
-    folder, and OpenVINO sends an event. A package that was imported before is not changed.
+    ONNX Runtime and OpenVINO start telemetry when they are imported: they write an identifier into
+    the home folder, and OpenVINO sends an event. If the package has been imported before, nothing
+    is changed.
     """
     with _import_lock:
         if package in sys.modules:
@@ -58,16 +59,16 @@ def start_session(
     provider: str = CPU,
     keep_memory: bool = True,
 ) -> Any:
-    """Start a session that prints nothing, for a file or its contents."""
+    """Start a session of ONNX Runtime that prints nothing; `model` is a file or its contents."""
     onnxruntime = import_onnxruntime()
     settings = onnxruntime.SessionOptions()
-    settings.log_severity_level = 4  # errors also raise an exception
+    settings.log_severity_level = 4  # no messages, because errors also raise exceptions
     settings.enable_cpu_mem_arena = settings.enable_mem_pattern = keep_memory
-    # Spinning threads start work sooner, but take processors from other work long after a run.
+    # Waiting threads that spin start work sooner, but occupy processors long after a run.
     settings.add_session_config_entry("session.intra_op.allow_spinning", "0")
     settings.intra_op_num_threads = int(threads or thread_limit() or 0)
     # A fallback to the CPU after a failure would print blocks of text.
     session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)
     session.disable_fallback()
-    session._model_bytes = None  # the contents of the file, kept only for a fallback
+    session._model_bytes = None  # frees the file's contents, kept for a fallback
     return session

@@ -18,9 +18,10 @@ ENDING = ("SIGTERM", "SIGHUP")
 def handle_signals(
     handler: Callable[[int, FrameType | None], object], names: Sequence[str] = ENDING
 ) -> Iterator[None]:
-    """Set a handler for signals while the block runs, in the main thread.
+    """Handle signals by `handler` while the block runs; in other than the main thread, do nothing.
 
-    Signals that are ignored, as by `nohup`, stay ignored. Other handlers stay, except Ctrl-C's.
+    Signals that are ignored, as by `nohup`, stay ignored. A handler that the program has set stays,
+    except the one for Ctrl-C.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():
@@ -36,7 +37,7 @@ def handle_signals(
 
 
 def exit_by_signal(number: int, frame: FrameType | None) -> None:
-    """End the program with the exit code that shells use; a handler for `handle_signals`."""
+    """End the program with the exit code that shells give; a handler for `handle_signals`."""
     raise SystemExit(128 + number)
 
 
@@ -44,7 +45,7 @@ def exit_by_signal(number: int, frame: FrameType | None) -> None:
 def noted_interrupts() -> Iterator[list[int]]:
     """Yield a list that gets an entry at each Ctrl-C, which still raises KeyboardInterrupt.
 
-    The list is needed because an interrupted import of a package may raise another error.
+    The list is needed because an interrupted import may raise another error instead.
     """
     noted: list[int] = []
 
@@ -68,7 +69,7 @@ def endings_interrupt() -> Iterator[None]:
 
 @contextmanager
 def sigterm_kept() -> Iterator[None]:
-    """Restore the handler of SIGTERM after the block, whose native code may change it."""
+    """Restore the handler of SIGTERM after the block, because native code in it may change it."""
     handler = signal.getsignal(signal.SIGTERM)
     yield
     if handler is not None and threading.current_thread() is threading.main_thread():
@@ -77,13 +78,16 @@ def sigterm_kept() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Defer Ctrl-C in the block, and in its new processes until `end_worker_by_signals`."""
+    """Defer Ctrl-C while the block runs.
+
+    Processes that are started in the block defer it until they call `end_worker_by_signals`.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     from multiprocessing import resource_tracker
 
-    # If the first process started the tracker, that would reset the mask.
+    # Starting multiprocessing's resource tracker unblocks Ctrl-C, so it is started before.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
@@ -98,7 +102,7 @@ def end_by_interrupt() -> None:
 
 
 def end_worker_by_signals() -> None:
-    """Let SIGTERM, and Ctrl-C that `signals_held` has deferred, end a worker by SystemExit."""
+    """Let SIGTERM and Ctrl-C end a worker process by SystemExit, even if Ctrl-C was deferred."""
     both = (signal.SIGINT, signal.SIGTERM)
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -113,7 +117,7 @@ def end_worker_by_signals() -> None:
 
 
 def kill_group(process: int = 0) -> None:
-    """Kill the group of a process, by default of this one; do nothing without process groups."""
+    """Kill all processes in the group of a process, by default this one's; not on Windows."""
     if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process, signal.SIGKILL)

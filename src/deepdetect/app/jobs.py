@@ -1,4 +1,4 @@
-"""Running tasks, each with a process and a folder. Both are removed when the page stops asking."""
+"""Running tasks: each has a process and a folder, which are removed if the page stops asking."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ..io.image_file import read_with, reading_options
 from .tasks import TASKS, Order
 
 FOLDER_PREFIX = "deepdetect-app-"
-"""Prefix of a server's folder in the folder for temporary files."""
+"""Prefix of the name of a server's folder, which is in the folder for temporary files."""
 
 NO_RESULT = "the task ended without a result: there may be too little memory for it"
 
@@ -36,15 +36,15 @@ class AppOptions:
 
     Attributes:
         port: port of 127.0.0.1; 0 takes any free one.
-        max_file_mb: size of the largest image file, in megabytes.
-        max_task_mb: size of all image files of one task, in megabytes.
-        max_files: number of images of one task.
+        max_file_mb: largest size of an image file, in megabytes.
+        max_task_mb: largest total size of the image files of one task, in megabytes.
+        max_files: largest number of images of one task.
         max_megapixels: larger images are rejected before they are decoded.
-        max_tasks: number of tasks that run at the same time.
+        max_tasks: largest number of tasks that run at the same time.
         max_task_s: seconds after which a task is stopped.
         abandoned_s: seconds without a request from the page, after which a task and its result are
-            discarded. Pages in the background ask once a minute.
-        max_request_s: seconds that the images of a task may take to arrive.
+            discarded. A page in a background tab sends a request only once a minute.
+        max_request_s: seconds within which all images of a task must arrive.
 
     Raises:
         OptionError: a value is out of its range.
@@ -70,8 +70,8 @@ class Job:
 
     Attributes:
         name: secret name that only the page knows.
-        state: state that is sent to the page.
-        started, asked: times of the start, and of the last request from the page.
+        state: what is sent to the page: the progress, the result or an error.
+        started, asked: times of the task's start, and of the last request from the page.
     """
 
     def __init__(self, order: Order) -> None:
@@ -83,7 +83,7 @@ class Job:
         context = multiprocessing.get_context("spawn")
         self._receiver, sender = context.Pipe(duplex=False)
         self.process = context.Process(target=run_task, args=(sender, order))
-        with signals_held(), sender:  # Ctrl-C is for the server, which ends its tasks
+        with signals_held(), sender:  # Ctrl-C ends the server, which ends the tasks
             self.process.start()
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
@@ -98,11 +98,11 @@ class Job:
         self._reason = reason
         if self.process.pid is not None:
             kill_group(self.process.pid)
-        self.process.kill()  # on Windows, or before it has made its group
+        self.process.kill()  # needed on Windows, and before it has made its group
         self._listener.join()
 
     def _listen(self) -> None:
-        with contextlib.suppress(EOFError, OSError), self._receiver:  # the process may be killed
+        with contextlib.suppress(EOFError, OSError), self._receiver:  # the process was killed
             while True:
                 self.state = self._receiver.recv()
         self.process.join()
@@ -111,7 +111,7 @@ class Job:
 
 
 class Jobs:
-    """All tasks of a server, which are started by the server's thread."""
+    """All tasks of a server. Only the server's own thread starts tasks."""
 
     def __init__(self, limits: AppOptions) -> None:
         self.limits = limits
@@ -119,7 +119,7 @@ class Jobs:
         self._folder = private_folder(FOLDER_PREFIX)
 
     def new_folder(self) -> Path:
-        """Make a folder for the images of a task that other users cannot read."""
+        """Make a folder, which other users cannot read, for the images of a task."""
         return Path(tempfile.mkdtemp(dir=self._folder))
 
     def check_room(self) -> None:
@@ -145,7 +145,7 @@ class Jobs:
     def remove(self, name: str) -> None:
         """End the task of this name, if it exists, and remove its files."""
         if job := self._jobs.pop(name, None):
-            job.stop("it was cancelled")
+            job.stop("the task was cancelled")
             shutil.rmtree(job.folder, ignore_errors=True)
 
     def end_overdue(self) -> None:
@@ -156,7 +156,7 @@ class Jobs:
                 self.remove(job.name)
             elif job.process.is_alive() and now - job.started > self.limits.max_task_s:
                 minutes = self.limits.max_task_s / 60
-                job.stop(f"it took over {minutes:.3g} minutes: use fewer or smaller images")
+                job.stop(f"the task took over {minutes:.3g} minutes: use fewer or smaller images")
 
     def close(self) -> None:
         """End all tasks, and remove all files."""
@@ -166,9 +166,9 @@ class Jobs:
 
 
 def run_task(sender: Connection, order: Order) -> None:
-    """Run a task in its own process: write files to `results`, and send states."""
+    """Run a task in its own process: write files to the folder `results`, and send states."""
     if hasattr(os, "setsid"):
-        os.setsid()  # a group, to end its child processes as well
+        os.setsid()  # a process group, so that child processes can also be ended
     for stream in (1, 2):  # discard what libraries print
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     end_with_parent(kill_group)
@@ -193,7 +193,7 @@ def run_task(sender: Connection, order: Order) -> None:
 
 
 def _for_the_page(message: str, order: Order) -> str:
-    """Replace paths by the user's names, and names of options by flags of `deepdetect app`."""
+    """Replace paths in a message by the user's file names, and options by command-line flags."""
     for number, image in enumerate(order.images):
         message = message.replace(str(image.path), image.name)
         message = message.replace(f"images[{number}]", image.name)

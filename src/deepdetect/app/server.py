@@ -1,7 +1,7 @@
 """Server of the page: for one user, only on the loopback address, without permanent storage.
 
 Starlette and uvicorn handle HTTP. The server rejects requests that name another host, come from
-another page, lack the key of this start, or are too large.
+another page, lack the secret key, which is new at each start, or are too large.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ SHUTDOWN_S = 1
 """The server waits this many seconds for running requests when it shuts down."""
 
 CHECK_EVERY_S = 1.0
-"""Interval in seconds at which tasks that take too long, or are abandoned, are ended."""
+"""Interval in seconds at which the server ends tasks that take too long or are abandoned."""
 
 MAX_IMAGE_PIXELS = 2_100_000
-"""Maximum number of pixels that a page may send. The page scales images to two megapixels, and then
-rounds their sides to multiples of 8."""
+"""Maximum number of pixels of an image that the page sends. It exceeds two megapixels, because the
+page scales images to that size, but then rounds their sides to multiples of 8."""
 
 POINT_BYTES = 12
 MAX_POINTS = 4000
-"""Maximum number of points that the page's slider allows. The page sends x, y and a size in float32
-for each."""
+"""Maximum number of points that the page's slider allows. Each takes `POINT_BYTES`: x, y and a
+size in float32."""
 
 MIN_SIDE = 16
 MAX_DESCRIPTION_BYTES = 1 << 18
-"""The names and sizes of images and the options of a task have at most this size as JSON."""
+"""Maximum size of the JSON with a task's options and the names and sizes of its images."""
 
 MAX_NAME_LENGTH = 200
 
@@ -89,15 +89,15 @@ VIEWER_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "frame-ancestors 'self'; sandbox allow-scripts allow-downloads"
 )
-"""Content security policy for the viewer of a model: one file with an inline script, isolated from
-the page around it."""
+"""Content security policy for the viewer of a 3D model. The viewer is one HTML file with an inline
+script, and the policy isolates it from the page around it."""
 
 
 class AppServer:
-    """Server of the page; as a context manager it ends all tasks and removes all files.
+    """Server of the page; at the end of a `with` block, it ends all tasks and removes all files.
 
     Attributes:
-        key: secret of this start; all requests except those for the page itself must have it.
+        key: secret key, new at each start, without which only the page itself is served.
         port: port that the server listens on.
 
     Raises:
@@ -113,7 +113,7 @@ class AppServer:
     def __init__(self, options: AppOptions = AppOptions()) -> None:
         self.options = options
         self.key = secrets.token_urlsafe(24)
-        self._processors = threading.Lock()  # one image at a time uses all processors
+        self._processors = threading.Lock()  # one image at a time, as each uses all processors
         self.jobs = Jobs(options)
         try:
             self._socket = socket.create_server((HOST, options.port))
@@ -145,7 +145,7 @@ class AppServer:
 
     @property
     def address(self) -> str:
-        """The address of the page."""
+        """The address of the page, which contains the key."""
         return f"http://{HOST}:{self.port}/#key={self.key}"
 
     def serve_forever(self) -> None:
@@ -157,7 +157,7 @@ class AppServer:
         self._server.should_exit = True
 
     def _routes(self) -> Starlette:
-        # The system's table may lack this type: programs on Windows change it.
+        # The system's table may have a wrong type for .js, because programs on Windows change it.
         mimetypes.add_type("text/javascript", ".js")
         return Starlette(
             routes=[
@@ -184,7 +184,7 @@ class AppServer:
         )
 
     async def _guard(self, request: Request, answer: RequestResponseEndpoint) -> Response:
-        """Reject requests for other hosts (DNS rebinding) and from other pages."""
+        """Reject requests that name another host (DNS rebinding) or come from another page."""
         host = request.headers.get("Host")
         allowed = [f"{name}:{self.port}" for name in NAMES]
         if self.port == HTTP_PORT:  # browsers omit this port
@@ -192,7 +192,7 @@ class AppServer:
         if host not in allowed:
             response = _refusal(421, "this address is not served here")
         elif request.headers.get("Origin", f"http://{host}") != f"http://{host}":
-            response = _refusal(403, "only the page of deepdetect app may ask this")
+            response = _refusal(403, "only the page of deepdetect app may send this request")
         else:
             response = await answer(request)
         for name, value in HEADERS.items():
@@ -231,7 +231,7 @@ class AppServer:
         }
 
     def _check_key(self, request: Request) -> None:
-        """Reject requests without the key of this start, and from other sites."""
+        """Reject requests that lack the server's key, or come from another site."""
         given = request.headers.get("Authorization", "").removeprefix("Bearer ")
         if not hmac.compare_digest(given.encode(), self.key.encode()):
             raise HTTPException(
@@ -239,14 +239,14 @@ class AppServer:
                 "the key of this page is wrong: open the address that deepdetect app printed",
             )
         if request.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
-            raise HTTPException(403, "only the page of deepdetect app may ask this")
+            raise HTTPException(403, "only the page of deepdetect app may send this request")
 
     @cached_property
     def _detector(self) -> DeepDetect:
         return DeepDetect(resolution="native")
 
     async def _heatmap(self, request: Request) -> Response:
-        """Receive an image, (H, W, 3) uint8; send its logits, (H, W) float32."""
+        """Receive an image, (H, W, 3) uint8; send the network's logits for it, (H, W) float32."""
 
         def logits(rgb: np.ndarray, _: bytes) -> np.ndarray:
             return self._detector.heatmap_and_logits(rgb)[1]
@@ -254,9 +254,9 @@ class AppServer:
         return await self._answer(request, 3, logits)
 
     async def _candidates(self, request: Request) -> Response:
-        """Receive the grey values of an image, (H, W) uint8; send its candidates for points.
+        """Receive the grey values of an image, (H, W) uint8; send its candidate points.
 
-        They are (4, N) float32: x, y, sigmas and logits, the strongest first.
+        The answer is (4, N) float32 with rows x, y, sigma and logit, the best candidate first.
         """
 
         def ranked(gray: np.ndarray, _: bytes) -> np.ndarray:
@@ -267,9 +267,10 @@ class AppServer:
         return await self._answer(request, 1, ranked)
 
     async def _descriptors(self, request: Request) -> Response:
-        """Receive grey values, (H, W) uint8, and points; send upright learned descriptors.
+        """Receive an image and points; send learned descriptors of the points at angle 0.
 
-        Points are (N, 2) float32 positions and (N,) sizes, descriptors (N, 64).
+        The image is (H, W) uint8 grey values. The points are float32: (N, 2) positions, followed
+        by (N,) sizes. The descriptors are (N, 64).
         """
 
         def described(gray: np.ndarray, numbers: bytes) -> np.ndarray:
@@ -289,7 +290,10 @@ class AppServer:
         compute: Callable[[np.ndarray, bytes], np.ndarray],
         max_points: int = 0,
     ) -> Response:
-        """Receive an image, (H, W, C) uint8, and points; send the float32 result of `compute`."""
+        """Receive an image and at most `max_points` points; send the float32 result of `compute`.
+
+        `compute` gets the image as (H, W, `channels`) uint8, and the bytes of the points.
+        """
         self._check_key(request)
         try:
             width, height = (int(request.query_params[name]) for name in ("width", "height"))
@@ -300,7 +304,7 @@ class AppServer:
         length = channels * width * height
         points = _body_length(request, length + POINT_BYTES * max_points) - length
         if points < 0 or points % POINT_BYTES:
-            raise HTTPException(400, "the request does not have the pixels of such an image")
+            raise HTTPException(400, "the request's length does not fit an image of this size")
         async with asyncio.timeout(self.options.max_request_s):
             body = await request.body()
         pixels = np.frombuffer(body, np.uint8, length).reshape(height, width, channels)
@@ -312,7 +316,7 @@ class AppServer:
         return Response(await run_in_threadpool(answer), media_type="application/octet-stream")
 
     async def _new_job(self, request: Request) -> Response:
-        """Start a task. The request is a length, JSON of this length, and the images."""
+        """Start a task. The request has a length, JSON text of this length, and the image files."""
         self._check_key(request)
         kind, options = request.query_params.get("kind", ""), self.options
         if kind not in TASKS:
@@ -336,7 +340,7 @@ class AppServer:
             if length > options.max_file_mb * 1e6:
                 raise OptionError(f"{name} is over {options.max_file_mb:g} MB: make it smaller")
         if sum(length for _, length in files) != left - 4 - size:
-            raise HTTPException(400, "the images differ from their stated length")
+            raise HTTPException(400, "the image files do not have the stated lengths")
         numbers = TASKS[kind].check(len(files), given)
         with contextlib.ExitStack() as made:
             folder = self.jobs.new_folder()
@@ -368,7 +372,7 @@ class AppServer:
         path = self._job(request).file(request.path_params["file"])
         if path is None:
             raise HTTPException(404, "there is no such file")
-        if path.suffix == ".html":  # a frame cannot send the key, but the task's name is secret
+        if path.suffix == ".html":  # a frame sends no key, but the task's name is secret
             return FileResponse(path, headers={"Content-Security-Policy": VIEWER_POLICY})
         self._check_key(request)
         return FileResponse(path)

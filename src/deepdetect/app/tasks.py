@@ -34,17 +34,18 @@ MODEL_STAGES = 9
 """Maximum number of progress stages of a 3D model, including the writing of its files."""
 
 ASSUMED_FOCAL = 1.2
-"""Assumed focal length of images without EXIF, in units of the longer side, as in COLMAP."""
+"""Focal length assumed for images without EXIF, as a multiple of the longer side, as in COLMAP."""
 
 Report = Callable[[str, int, int], None]
-"""Function called with the stage that begins, the number of stages done, and their total (or 0)."""
+"""Function called when a stage begins, with its name, the number of stages done, and the number
+of all stages, which is 0 if unknown."""
 
 Options = Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class SentImage:
-    """Image file sent by the page, and its name there, which is never used as a path."""
+    """Image file that the page sent. The user's `name` for it is never used as a path."""
 
     path: Path
     name: str
@@ -55,7 +56,7 @@ Images = Sequence[SentImage]
 
 @dataclass(frozen=True)
 class Order:
-    """A task to run, in its own folder, which holds the images."""
+    """A task to run. `folder` belongs to this task only, and contains the images."""
 
     kind: str
     images: Images
@@ -66,7 +67,7 @@ class Order:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Result of a task: names and values as text, the file to show, and files to download."""
+    """Result of a task: `numbers` as text by label, the file to show, and the files to download."""
 
     numbers: Mapping[str, str]
     shown: str
@@ -77,9 +78,10 @@ class TaskResult:
 class Task:
     """A kind of task.
 
-    `files` are the smallest and the largest number of images, None for the server's limit.
-    `packages` are those not installed with DeepDetect. `options` maps names of numeric options to
-    labels on the page. `folder` says whether the task is for whole folders.
+    `files` are the smallest and the largest number of images; None stands for the server's limit.
+    `packages` are packages that the task needs and that are not installed with DeepDetect.
+    `options` maps names of numeric options to their labels on the page. With `folder`, the page
+    offers the task for whole folders instead of a few chosen images.
     """
 
     title: str
@@ -92,7 +94,7 @@ class Task:
 
     @property
     def missing(self) -> str:
-        """Command that installs missing packages, or an empty string."""
+        """The command that installs missing packages, or an empty string if none is missing."""
         absent = [name for name in self.packages if importlib.util.find_spec(name) is None]
         return install_command(*absent) if absent else ""
 
@@ -108,12 +110,14 @@ class Task:
         for name, value in options.items():
             real = isinstance(value, (int, float)) and not isinstance(value, bool)
             if name not in self.options or not real or not 0 < value < 1e6:  # type: ignore[operator]
-                raise OptionError(f"{self.title} does not take {name!r:.40} as {value!r:.40}")
+                raise OptionError(
+                    f"{self.title} does not accept {name!r:.40} with the value {value!r:.40}"
+                )
         return {name: float(value) for name, value in options.items()}  # type: ignore[arg-type]
 
 
 def run_match(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
-    """Match two images, guided by a geometry."""
+    """Match two images, guided by a geometry that is estimated first."""
     stages = _stages(GUIDED_STAGES, report)
     first, second = (load_image(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
@@ -146,7 +150,7 @@ def run_register(images: Images, options: Options, folder: Path, report: Report)
     numbers = {
         "Matches": f"{found.matches:,}",
         "Overlap": f"{found.valid.mean():.0%} of the first",
-        "Correlation": f"{found.zncc:.3f} (1 is the same)",
+        "Correlation": f"{found.zncc:.3f} (1 means identical)",
     }
     return TaskResult(numbers, "checkerboard.png", (*pictures, "homography.txt"))
 
@@ -257,7 +261,7 @@ def run_folder_keypoints(
 
 
 def _entry_name(name: str, others: Sequence[str]) -> str:
-    """Return a file name without folders for an image's table, unique in the archive.
+    """Return a name for an image's table in the archive: without folders, and not in `others`.
 
     Example:
         >>> _entry_name("a/b.jpg", []), _entry_name("../b", ["b.csv"])
@@ -270,7 +274,10 @@ def _entry_name(name: str, others: Sequence[str]) -> str:
 
 
 def _stages(names: Sequence[str], report: Report) -> Callable[[str], None]:
-    """Report the first stage; return a function to call after each. The last one is "files"."""
+    """Report the first stage; return a function to call at the end of each.
+
+    A last stage "files" is added, in which the results are written.
+    """
     all_names, done = [*names, "files"], itertools.count()
 
     def ended(_: str) -> None:
@@ -292,10 +299,14 @@ TASKS: dict[str, Task] = {
         "coloured points, and a depth map",
         run_reconstruct,
         (2, 2),
-        options={"focal_px": "Focal length in pixels, if the images lack it"},
+        options={"focal_px": "Focal length in pixels, if the images' EXIF lacks it"},
     ),
     "folder-keypoints": Task(
-        "Keypoints", "of each image, as CSV files", run_folder_keypoints, (1, None), folder=True
+        "Keypoints",
+        "the best keypoints of each image, as CSV files",
+        run_folder_keypoints,
+        (1, None),
+        folder=True,
     ),
     "folder-stitch": Task("Panorama", "from all images", run_stitch, (2, None), folder=True),
     "folder-model": Task(

@@ -1,8 +1,9 @@
 """Engines that run the tasks of a collection: processes of this machine, or a Ray cluster.
 
 To add an engine, write a function with the signature of `map_in_processes` and add it to `ENGINES`.
-Ray restarts a worker that dies, and repeats its tasks. Each outcome arrives once, but a function
-may run twice. So it must write files under temporary names, and rename them.
+Ray restarts a worker that dies, and repeats its tasks. Each outcome arrives once, but the function
+may have run twice for a task. It must therefore write each file under a temporary name, and rename
+the complete file.
 """
 
 from __future__ import annotations
@@ -28,16 +29,17 @@ from .._shared.machine import (
 )
 
 MAX_BLOCKS = 4096
-"""The work has at most this number of parts, as scheduling one costs Ray milliseconds. A part is
-repeated if its worker dies."""
+"""The tasks are divided into at most this number of parts, because scheduling a part costs Ray
+milliseconds. If a worker dies, its whole part is repeated."""
 
 PROCESSORS_PER_WORKER = 0.5
-"""A worker reserves this share of a processor, though it uses a whole one. So after the loss of
-half the machines, the rest can hold all workers. Otherwise tasks would wait forever for a lost
-worker."""
+"""Each worker reserves only this fraction of a processor in Ray, though it uses a whole one. If
+half of the machines are lost, the others can therefore take over all workers. Otherwise tasks would
+wait forever for a lost worker."""
 
 OBJECT_STORE_BYTES = 200_000_000
-"""Shared memory of a cluster that is started here. It can be small: results go to files."""
+"""Shared memory of a cluster that this module starts. It can be small, because results are written
+to files."""
 
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -53,17 +55,18 @@ def map_on_ray(
 ) -> Iterator[Outcome]:
     """Apply a function to every task on a Ray cluster, in workers of one processor each.
 
-    The cluster is the one that this process is connected to, that RAY_ADDRESS names, or that runs
-    on this machine (`ray start`). Without one, or with RAY_ADDRESS=local, a cluster is started for
-    the duration of the work. All its machines need this package, and the files under the same
-    paths. A DeepDetectError comes from the function, or says that the cluster failed.
+    The cluster is the one to which this process is connected, or else the one that RAY_ADDRESS
+    names, or else one that runs on this machine (`ray start`). Without any, or with
+    RAY_ADDRESS=local, a cluster is started for the duration of the work. All machines of the
+    cluster need this package, and the files under the same paths. A DeepDetectError was raised by
+    the function, or says that the cluster failed.
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")
     ray = _import_ray()
     if not len(tasks):
         return
-    # Ray prints messages about its workers, but standard output is for results.
+    # Ray prints messages about its workers to standard output, which is for results.
     with contextlib.redirect_stdout(sys.stderr), _connected(ray, workers):
         count = min(workers or int(ray.cluster_resources().get("CPU", 1)), len(tasks))
         rows = ray.data.from_items(
@@ -91,7 +94,7 @@ def map_on_ray(
 class _Worker:
     def __init__(self, function: Callable[[Any], Any], folder: str) -> None:
         self.function = function
-        with contextlib.suppress(OSError):  # relative paths are the caller's
+        with contextlib.suppress(OSError):  # relative paths start at the caller's folder
             os.chdir(folder)
         use_one_thread()
         disable_malloc_trim()
@@ -99,7 +102,7 @@ class _Worker:
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         try:
             outcome = self.function(pickle.loads(row["task"]))
-        except DeepDetectError as error:  # Ray would add a traceback
+        except DeepDetectError as error:  # if raised, Ray would add a traceback
             outcome = error
         return {"outcome": pickle.dumps(outcome)}
 
@@ -124,16 +127,16 @@ def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
             object_store_memory=OBJECT_STORE_BYTES,
             **quiet,
         )
-    except Exception as error:  # after half a minute, Ray raises errors of many types
+    except Exception as error:  # Ray raises errors of many types, after half a minute
         ray.shutdown()
         raise DeepDetectError(
-            f"Ray cannot start ({first_line(error)}): try later, or use the engine processes"
+            f"Ray cannot start ({first_line(error)}): try later, or use the engine 'processes'"
         ) from error
 
 
 @contextmanager
 def _connected(ray: Any, workers: int | None) -> Iterator[None]:
-    """Connect to a cluster or start one, unless there is a connection; silence Ray Data."""
+    """Connect to a Ray cluster or start one, unless already connected; silence Ray Data."""
     before = ray.is_initialized()
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     if not before:

@@ -1,6 +1,6 @@
 """Extraction of the features of all images below a folder, into a file in hloc's layout.
 
-See https://github.com/cvg/Hierarchical-Localization; pixel coordinates are the same as here.
+See https://github.com/cvg/Hierarchical-Localization; its pixel coordinates are DeepDetect's.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ..io.image_file import ReadingOptions, reading_options
 from .hdf5 import SETTINGS, BatchReport, Group, Item, State, damaged, fill_file
 
 ROOT_SIFT_NORM = 512
-"""RootSIFT descriptors stored as bytes have this length."""
+"""Euclidean norm of RootSIFT descriptors that are stored as bytes."""
 
 
 @suggest_keywords
@@ -47,35 +47,43 @@ def extract_features(
 ) -> BatchReport:
     """Extract the features of all images below a folder into an HDF5 file in hloc's layout.
 
-    The group of an image is named by its path below the folder, such as "db/1.jpg". It holds
-    `keypoints` (N, 2) float32, x right and y down in pixels, centre of the first pixel (0, 0), with
-    the attribute `uncertainty` in pixels; `descriptors` (D, N) float32 of length 1, D = 64 learned
-    ones or 128 of RootSIFT for `DeepDetect`; `scores` (N,) float32, higher is better; `colors`
-    (N, 3) uint8 sRGB; `image_size` (width, height) int32; and, for keypoints with sizes and angles,
-    `scales` (N,) float32, sigma in pixels (half the size), and `oris` (N,) float32 in degrees.
+    Each image has a group, named by its path below the folder, such as "db/1.jpg". It contains:
+
+    - `keypoints` (N, 2) float32: x right and y down in pixels, with the centre of the first pixel
+      at (0, 0). The attribute `uncertainty` is their uncertainty in pixels.
+    - `descriptors` (D, N) float32 of unit length: D is 64 for learned descriptors and 128 for
+      RootSIFT, which the keypoints of a `DeepDetect` always get.
+    - `scores` (N,) float32: higher is better.
+    - `colors` (N, 3) uint8: sRGB colours at the keypoints.
+    - `image_size` (2,) int32: width and height.
+    - `scales` (N,) and `oris` (N,) float32, if the keypoints have sizes and angles: sigma in
+      pixels, which is half the size, and the angle in degrees.
 
     The same call continues an interrupted run. It skips unchanged images, adds new ones, and
-    removes those that are missing or can no longer be read: a file is for one folder. It starts
-    processes, so a script must call it under `if __name__ == "__main__":`.
+    removes the groups of images that are missing or can no longer be read. A file is therefore for
+    one folder only. The function starts processes, so a script must call it under
+    `if __name__ == "__main__":`.
 
     Args:
         folder: folder of the images.
-        path: the file.
-        detector: a `PointDetector`, the default, or a `DeepDetect` (with `threads=1`, because every
-            process has one).
-        selection: which pixels of a `DeepDetect` become keypoints; None: those over 0.5.
-        max_megapixels: limit for an image, as in `load_image`; larger ones are failures.
-        engine: "processes" of this machine, or "ray" for a cluster.
-        workers: number of processes; default one per processor.
-        overwrite: replace the file.
+        path: the HDF5 file to write.
+        detector: a `PointDetector`, which is the default, or a `DeepDetect` with `threads=1`,
+            because every process has a detector of its own.
+        selection: which pixels of a `DeepDetect` heat map become keypoints; None: those with a
+            probability above 0.5.
+        max_megapixels: limit for an image, as in `load_image`; larger images count as failures.
+        engine: "processes" for processes on this machine, or "ray" for a Ray cluster.
+        workers: number of processes; default: one per processor.
+        overwrite: replace an existing file instead of continuing it.
         quiet: show no progress bar.
 
     Returns:
-        Counts of keypoints, and `failures`: an image that cannot be read does not stop the others.
+        The number of keypoints of each image, and `failures`: images that could not be read, which
+        do not stop the others.
 
     Raises:
         ImageError: the folder is missing, or holds no image.
-        OptionError: an option is unknown, or the file exists with other settings.
+        OptionError: an option is unknown, or the file was made with other settings.
         MissingExtraError: h5py, or what the engine needs, is not installed.
         DeepDetectError: the file cannot be written.
 
@@ -109,7 +117,7 @@ def extract_features(
             root=root,
             selection=selection,
             detector=detector,
-            reading=reading,  # other processes do not have the command's
+            reading=reading,  # other processes do not inherit these options
         ),
         of="images",
         others_stay=lambda _: False,
@@ -140,7 +148,7 @@ def _extract(
                 keypoints = detector.describe(rgb, keypoints)
             else:
                 keypoints = describe_keypoints(gray, keypoints)
-            # Keypoints are as uncertain as a pixel of the scaled image in which they were found.
+            # The uncertainty is a pixel of the scaled image in which the keypoints were found.
             seen = seen_size(gray.shape, HeatmapOptions(detector.settings["resolution"]))
             uncertainty = max(gray.shape[1] / seen[0], gray.shape[0] / seen[1])
             column, row = np.rint(keypoints.xy).astype(np.int64).T
@@ -152,7 +160,7 @@ def _extract(
 def feature_group(
     name: str, keypoints: Keypoints, state: State = (), uncertainty: float = 1.0
 ) -> Group:
-    """Return hloc's group of the keypoints of an image; `uncertainty` is in pixels.
+    """Return the group of an image's keypoints in hloc's layout; `uncertainty` is in pixels.
 
     Example:
         >>> keypoints = Keypoints([[3, 4]], [0.9], (8, 6), descriptors=np.full((1, 128), 45, "u1"))
@@ -173,15 +181,15 @@ def feature_group(
 
 
 def read_keypoints(file: Any, name: str) -> Keypoints:
-    """Return the keypoints of an image in a file; RootSIFT descriptors become bytes again.
+    """Return the keypoints of the image `name` in an HDF5 file.
 
-    Files of other programs do not give the type of descriptors. Raises an InvalidFileError for
-    damaged keypoints.
+    RootSIFT descriptors become bytes again. Files of other programs do not tell the type of their
+    descriptors, so it stays unknown. Raises an InvalidFileError for damaged keypoints.
     """
     try:
         settings = json.loads(file.attrs.get(SETTINGS, "{}"))
         return _keypoints_of(file[name], settings.get("descriptor"))
-    # h5py raises any of these for damaged files; a wrong shape can need too much memory.
+    # For damaged files, h5py raises any of these; a wrong shape can need too much memory.
     except (
         OSError,
         RuntimeError,
@@ -198,7 +206,7 @@ def _keypoints_of(group: Any, descriptor_type: str | None) -> Keypoints:
     arrays = {name: group[name][()] for name in group if name != "colors"}
     xy = np.asarray(arrays["keypoints"], np.float32)
     size, scales = arrays.get("image_size"), arrays.get("scales")
-    if size is None:  # the smallest image that contains the keypoints
+    if size is None:  # take the smallest image that contains the keypoints
         size = np.ceil(xy.max(axis=0, initial=0)) + 1
     angles = arrays.get("oris")
     if angles is not None:

@@ -1,8 +1,8 @@
 """HDF5 files that many processes fill, and that survive a killed process.
 
-An HDF5 file has one writer, and may be lost if the writer is killed. So each task writes a small
-file of its own, a shard, whole or not at all. At the end one process merges the shards into a copy
-of the file, which replaces the file when it is complete.
+Only one process at a time can write to an HDF5 file, and if that process is killed, the file may be
+lost. So each task writes a small file of its own, a shard, which appears complete or not at all. At
+the end one process merges the shards into a copy of the file, and the complete copy replaces it.
 """
 
 from __future__ import annotations
@@ -38,24 +38,25 @@ from .._shared.records import check_same, key, lock, plain
 from .engines import ENGINES
 
 SETTINGS = "deepdetect"
-"""Attribute of the file: JSON of the settings that its content depends on."""
+"""Name of the attribute of a file with the settings that its content depends on, as JSON."""
 
 STATE = "source_state"
-"""Attribute of a group: the state of its input."""
+"""Name of the attribute of a group with the state of its input."""
 
 FORMAT = ("v110", "v110")
-"""Files can be read by HDF5 1.10 (2016) and later; groups of a million members stay fast."""
+"""Oldest and newest file format to write: HDF5 1.10 (2016) and later can read the files, and groups
+with a million members stay fast."""
 
 MIN_SHARDS = 256
-"""There are at least this number of shards if there are as many inputs, so that all workers have
-something to do. Chosen by hand."""
+"""The inputs are divided into at least this number of shards if there are that many inputs, so that
+all workers have something to do. Chosen by hand."""
 
 LARGEST_SHARD = 32
-"""A shard has at most this number of inputs, which are lost with a killed worker. Smaller shards
-would be more files. Chosen by hand."""
+"""A shard has at most this number of inputs, because a killed worker loses its work on them.
+Smaller shards would mean more files. Chosen by hand."""
 
 State = tuple[int, ...]
-"""State of an input: whole numbers that change if the input changes."""
+"""State of an input: whole numbers that change if the input changes, such as size and time."""
 
 Item = tuple[Any, State]
 """An input: its name and its state."""
@@ -63,7 +64,7 @@ Item = tuple[Any, State]
 
 @dataclass(frozen=True)
 class Group:
-    """A group of an HDF5 file: path, datasets, state of its input, and attributes of datasets."""
+    """A group of an HDF5 file: its path, its datasets, their attributes, and its input's state."""
 
     name: str
     arrays: Mapping[str, np.ndarray]
@@ -72,16 +73,18 @@ class Group:
 
 
 MakeGroups = Callable[[Sequence[Item], dict[Any, int], list[str]], Iterator[Group]]
-"""Function that yields the groups of inputs, and notes a count or a failure for each input."""
+"""Function that yields the groups made from inputs. For each input, it adds a count to its second
+argument or a failure to its third."""
 
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What an extraction or matching did.
+    """Outcome of an extraction of features, or of a matching of pairs.
 
     Attributes:
         path: the file.
-        counts: numbers of keypoints of the processed images, or of matches of the processed pairs.
+        counts: number of keypoints of each image, or of matches of each pair, processed by this
+            run.
         skipped: number of images or pairs that an earlier run had processed.
         failures: a sentence on each image or pair that could not be processed.
         of: "images" or "pairs".
@@ -98,7 +101,7 @@ class BatchReport:
         if self.failures:
             total = len(self.counts) + self.skipped + len(self.failures)
             raise BatchError(
-                f"{len(self.failures)} of {total} {self.of} failed, the others are done",
+                f"{len(self.failures)} of {total} {self.of} failed; the others are done",
                 self.failures,
             )
 
@@ -113,14 +116,15 @@ def import_h5py() -> Any:
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file to read it; also handle errors of damaged files inside the block."""
+    """Open an HDF5 file for reading; raise an InvalidFileError if the block finds it damaged."""
     h5py = import_h5py()
     if path.is_dir():
-        raise InvalidFileError(f"{path} is a folder: name a file of features or matches")
+        raise InvalidFileError(f"{path} is a folder: give a file of features or matches")
     if not path.is_file():
         raise MissingFileError(f"there is no file {path}: check the path")
     try:
-        # No process writes to a file under its final name, and network folders may lack locks.
+        # No process writes to a file under its final name, so no lock is needed. Network folders
+        # may lack locks.
         file = h5py.File(path, "r", locking=False)
     except OSError as error:
         raise DeepDetectError(
@@ -149,7 +153,7 @@ def damaged(path: Path, error: Exception) -> InvalidFileError:
 
 @contextmanager
 def _written(path: Path, mode: str) -> Iterator[Any]:
-    """Open a temporary file for writing; convert errors of the system to a numbered OSError."""
+    """Open an HDF5 file for writing; raise errors of the operating system as a short OSError."""
     try:
         with import_h5py().File(path, mode, libver=FORMAT) as file:
             yield file
@@ -161,7 +165,7 @@ def _written(path: Path, mode: str) -> Iterator[Any]:
 
 
 def write_groups(path: Path, groups: Iterable[Group]) -> None:
-    """Write groups one by one to a file, whole or not at all; without groups, write no file."""
+    """Write groups one by one to a file, complete or not at all; without groups, write no file."""
     groups = iter(groups)
     first = next(groups, None)
     if first is None:
@@ -176,7 +180,7 @@ def write_groups(path: Path, groups: Iterable[Group]) -> None:
 
 
 def state_of(group: Any) -> State:
-    """Return the state of a group's input, or an empty one for files of other programs."""
+    """Return the state of a group's input, or () if another program wrote the file."""
     return tuple(int(number) for number in group.attrs.get(STATE, ()))
 
 
@@ -195,17 +199,17 @@ def fill_file(
 ) -> BatchReport:
     """Make the wanted groups that are not in the file yet, in the processes of an engine.
 
-    The content depends on the settings and the inputs. Shards of other settings are not used.
-    `wanted` gives the possible groups of each input: if none of them exists in the given state, the
-    first one is made. `others_stay` decides for each group of another input, or of an input that
-    fails, whether it stays in the file.
+    An existing file must have the same `settings`. Shards that an interrupted run has left are used
+    if they have the same settings. `wanted` maps each input to the groups that can serve it, each
+    with the state of the input: if none of them is in the file with this state, the first one is
+    made. `others_stay` says of any other group, or a group whose input fails, whether it stays.
     """
     import_h5py()
     map_tasks, work = look_up("engine", engine, ENGINES), partial(_write_shard, make=make)
-    list(map_tasks(work, [], workers))  # raises an error for a missing engine before the work
+    list(map_tasks(work, [], workers))  # raises an error before the work if the engine is missing
     target, settings = Path(path).absolute(), plain(settings)
     if target.is_dir():
-        raise OptionError(f"{target} is a folder: name a file in it with -o")
+        raise OptionError(f"{target} is a folder: give a file in it with -o")
     before = [target] if target.exists() and not overwrite else []
     for kept in before:
         with open_hdf5(kept) as file:
@@ -258,19 +262,19 @@ def fill_file(
                         bar.update(1)
                     for name in filter(merged.__contains__, gone):
                         del merged[name]
-        with contextlib.suppress(OSError):  # remaining shards are merged again, to no effect
+        with contextlib.suppress(OSError):  # the next run merges shards that remain, without effect
             shutil.rmtree(folder)
     return BatchReport(Path(path), dict(sorted(counts.items())), skipped, (*sorted(failures),), of)
 
 
 def _shard_files(folder: Path) -> list[Path]:
-    """List the shards, oldest first, because newer ones replace their groups."""
+    """List the shards, oldest first, because groups of newer ones replace those of older ones."""
     shards = [path for path in folder.glob("*.h5") if not path.name.startswith(".")]
     return sorted(shards, key=lambda path: (path.stat().st_mtime_ns, path.name))
 
 
 def _divided(items: Sequence[Item], folder: Path) -> list[tuple[Path, Sequence[Item]]]:
-    """Divide inputs into shards; the same names give the same file."""
+    """Divide inputs into shards; return the file of each, whose name depends on its input names."""
     size = min(LARGEST_SHARD, max(1, len(items) // MIN_SHARDS))
     parts = [items[k : k + size] for k in range(0, len(items), size)]
     return [(folder / f"{key([name for name, _ in part])}.h5", part) for part in parts]
@@ -296,8 +300,8 @@ def _copy_groups(shard: Path, merged: Any) -> None:
 
 
 def _leaves(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the paths and groups that this package has written."""
-    for name, member in group.items():  # None: a dangling link in a damaged file
+    """Yield the path and the object of each group, at any depth, that this package has written."""
+    for name, member in group.items():  # a dangling link in a damaged file is None
         if member is not None and STATE in member.attrs:
             yield prefix + name, member
         elif hasattr(member, "items"):

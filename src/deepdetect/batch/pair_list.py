@@ -24,7 +24,7 @@ def pair_name(name0: str, name1: str) -> str:
 
 
 def read_pairs(path: str | Path) -> list[Pair]:
-    """Read a list of pairs: two image names on each line, separated by a blank or a tab.
+    """Read a list of pairs: two image names on each line, separated by blanks or by a tab.
 
     If a pair is listed twice, in either order, only the first one counts.
 
@@ -35,7 +35,8 @@ def read_pairs(path: str | Path) -> list[Pair]:
         text = Path(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise MissingFileError(
-            f"there is no file {path}: give a file, exhaustive, sequential:10 or similar:20"
+            f"there is no file {path}: give a file or one of 'exhaustive', 'sequential:10', "
+            "'similar:20'"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
@@ -47,7 +48,7 @@ def read_pairs(path: str | Path) -> list[Pair]:
 
 
 def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
-    """Write a list of pairs as `read_pairs` and hloc read it."""
+    """Write a list of pairs that `read_pairs` can read, and also hloc if no name has blanks."""
     blanks = any(" " in name for pair in pairs for name in pair)
     lines = [("\t" if blanks else " ").join(pair) + "\n" for pair in pairs]
     with atomic_path(path) as temporary:
@@ -55,26 +56,27 @@ def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
 
 
 SIMILAR = 20
-"""The choice "similar" alone matches each image with this number of others. Chosen by hand."""
+"""The choice "similar", without a number, matches each image with this many others. Chosen by
+hand."""
 
 
 def similar(pairs: object) -> int | None:
-    """Return N of "similar:N", or None for another choice of pairs."""
+    """Return N of "similar:N", `SIMILAR` for "similar", or None for another choice of pairs."""
     match = isinstance(pairs, str) and re.fullmatch("similar(?::([1-9][0-9]{0,8}))?", pairs)
     return int(match[1] or SIMILAR) if match else None
 
 
 def following(pairs: object) -> int | None:
-    """Return N of "sequential:N", unlimited for "exhaustive", or None for another choice."""
+    """Return N of "sequential:N", a huge N for "exhaustive", or None for another choice."""
     match = isinstance(pairs, str) and re.fullmatch("sequential:([1-9][0-9]{0,8})", pairs)
     return sys.maxsize if pairs == "exhaustive" else int(match[1]) if match else None
 
 
 def list_pairs(pairs: str | Path | Sequence[Sequence[str]], names: Sequence[str]) -> list[Pair]:
-    """Return the chosen pairs of the named images.
+    """Return the pairs of images that a choice selects.
 
-    The choice is "exhaustive" (all), "sequential:N" (each image with the N that follow it), a list
-    of pairs of names, or a text file with a pair on each line.
+    The choice `pairs` is "exhaustive" (all pairs of `names`), "sequential:N" (each name with the N
+    that follow it), a list of pairs of names, or a text file with a pair on each line.
 
     Example:
         >>> list_pairs("sequential:2", ["a", "b", "c", "d"])
@@ -87,13 +89,16 @@ def list_pairs(pairs: str | Path | Sequence[Sequence[str]], names: Sequence[str]
 
 
 def check_pairs(pairs: Sequence[Sequence[str]], place: str = "`pairs`") -> list[Pair]:
-    """Return pairs without repetitions, in either order; raise an OptionError for a wrong pair."""
+    """Return pairs; leave out those that repeat an earlier one, in the same or the other order.
+
+    Raises an OptionError for a wrong pair.
+    """
     kept: dict[Pair, None] = {}
     for pair in pairs:
         if isinstance(pair, str) or len(pair) != 2 or pair[0] == pair[1] or not all(pair):
             raise OptionError(
                 f"{pair!r} in {place} is not a pair: give the names of two images; in a text file, "
-                "on one line with a blank between them, or a tab if the names have blanks"
+                "put both on one line, separated by a blank, or by a tab if names have blanks"
             )
         if (pair[1], pair[0]) not in kept:
             kept[pair[0], pair[1]] = None

@@ -44,15 +44,15 @@ class PairMatchingOptions:
     """How the features of two images are matched.
 
     Attributes:
-        ratio: limit of the ratio test: the best distance must be below this share of the
-            second-best. None: the default of `match_features`.
+        ratio: limit of Lowe's ratio test: the distance to the nearest neighbour must be below this
+            fraction of the distance to the second-nearest. None: the default of `match_features`.
         mutual: keep only mutual nearest neighbours.
-        filter_by: which nearest neighbours are matches: those that pass Lowe's test ("ratio"), or
-            that move as the matches around them do ("neighbours").
+        filter_by: which nearest neighbours are matches: those that pass the ratio test ("ratio"),
+            or that move as the matches around them do ("neighbours").
         matcher: name of the matcher: "auto", "exact", "patchmatch" or "flann".
         verify: keep only the inliers of a geometry that is estimated from the matches:
-            "fundamental", "homography" or "auto". None keeps all.
-        inlier_threshold: largest error of an inlier in pixels.
+            "fundamental", "homography" or "auto". None keeps all matches.
+        inlier_threshold: with `verify`, the largest error of an inlier in pixels.
         seed: seed of random choices.
 
     Raises:
@@ -77,7 +77,9 @@ class PairMatchingOptions:
         check_filter(self.filter_by, self.ratio, self.mutual)
         check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
         if self.verify == "essential":
-            raise OptionError("`verify` must be fundamental, homography or auto without cameras")
+            raise OptionError(
+                "without cameras, `verify` must be 'fundamental', 'homography' or 'auto'"
+            )
         check_model(self.verify or "auto", self.seed, GeometryOptions())
 
 
@@ -95,31 +97,38 @@ def match_pairs(
 ) -> BatchReport:
     """Match the features of pairs of images into an HDF5 file in hloc's layout.
 
-    Each pair has a group NAME0/NAME1, with "-" for each "/" in the names. It holds `matches0` (N0,)
-    int32, the match in the second image of each keypoint of the first, or -1; and
-    `matching_scores0` (N0,) float32 in [0, 1], which is 1 - Lowe's ratio or, with the filter by
-    neighbours, the probability that the match is correct. If a word chooses the pairs,
-    PATH.pairs.txt lists them, as hloc needs it.
+    Each pair has a group NAME0/NAME1, with "-" instead of each "/" in the names. If the first image
+    has N0 keypoints, the group contains:
+
+    - `matches0` (N0,) int32: for each keypoint of the first image, the index of its match among the
+      keypoints of the second image, or -1 if it has no match.
+    - `matching_scores0` (N0,) float32 in [0, 1]: 1 minus the distance ratio of Lowe's test or, with
+      `filter_by="neighbours"`, the probability that the match is correct.
+
+    If `pairs` is a word such as "exhaustive", the pairs are also listed in the file PATH.pairs.txt,
+    which hloc needs.
 
     The same call continues an interrupted run: it skips pairs with unchanged features and adds new
-    ones. It starts processes, so a script must call it under `if __name__ == "__main__":`.
+    ones. The function starts processes, so a script must call it under
+    `if __name__ == "__main__":`.
 
     Args:
-        features: file of `extract_features`, or of hloc.
-        pairs: "exhaustive" (all), "sequential:10" (each image with the 10 that follow it by name),
-            "similar:20" or "similar" (with the 20 most similar ones, by VLAD of the best 512
-            keypoints; earlier pairs stay if new images change them), a list of pairs of names, or a
-            text file with a pair on each line. A pair listed twice, in either order, counts once.
-        path: the file.
+        features: file written by `extract_features` or by hloc.
+        pairs: "exhaustive" (all pairs), "sequential:10" (each image with the 10 that follow it by
+            name), "similar:20" or "similar" (each image with the 20 most similar ones, by VLAD of
+            their best 512 keypoints), a list of pairs of names, or a text file with a pair on each
+            line. A pair listed twice, in either order, counts once. Pairs of an earlier run stay in
+            the file, also if new images change which ones are most similar.
+        path: the HDF5 file to write.
         options: how pairs are matched.
-        engine: "processes" of this machine, or "ray" for a cluster.
-        workers: number of processes; default one per processor.
-        overwrite: replace the file.
+        engine: "processes" for processes on this machine, or "ray" for a Ray cluster.
+        workers: number of processes; default: one per processor.
+        overwrite: replace an existing file instead of continuing it.
         quiet: show no progress bar.
 
     Returns:
-        Counts of matches, and `failures`: a pair without features, or with descriptors of different
-        types, does not stop the others.
+        The number of matches of each pair, and `failures`: pairs without features, or with
+        descriptors of different types, which do not stop the others.
 
     Raises:
         OptionError: an option is unknown, a pair is wrong, or the file has other settings.
@@ -132,9 +141,9 @@ def match_pairs(
     """
     source = Path(features).absolute()
     if not (alike := similar(pairs)):
-        list_pairs(pairs, ())  # raises an error for wrong pairs before the work
+        list_pairs(pairs, ())  # raises an error for wrong pairs before long work
     if source == Path(path).absolute():
-        raise OptionError(f"{path} holds the features: give the matches another file with -o")
+        raise OptionError(f"{path} holds the features: write the matches to another file with -o")
     if options.filter_by == "neighbours" and (first := first_keypoints(source)):
         require_suited(first)
     with open_hdf5(source) as file:
@@ -163,7 +172,7 @@ def match_pairs(
 
 
 def first_keypoints(features: Path) -> Keypoints | None:
-    """Return the first undamaged keypoints in a file, because all images have the same kind."""
+    """Return the first undamaged keypoints in a file; those of all images are of one kind."""
     with open_hdf5(features) as file:
         for name in feature_names(file):
             with suppress(InvalidFileError):
@@ -174,11 +183,12 @@ def first_keypoints(features: Path) -> Keypoints | None:
 def _find_pairs(
     features: Path, pairs: Sequence[Pair]
 ) -> tuple[dict[Pair, dict[str, State]], list[str], set[str], str]:
-    """Look up the features of pairs.
+    """Find out which pairs can be matched with the features in a file.
 
-    Returns the possible groups of each pair that can be matched, with the states of its features; a
-    sentence on each other pair; the groups of pairs without features, whose matches are obsolete;
-    and a digest of the settings of the features.
+    Returns, first, the two groups in which the matches of such a pair may be stored, each with the
+    states of the pair's features; second, a sentence on each pair that cannot be matched; third,
+    the groups of pairs without features, whose matches are obsolete; last, a digest of the settings
+    of the features.
     """
     wanted: dict[Pair, dict[str, State]] = {}
     failures: list[str] = []
@@ -196,7 +206,8 @@ def _find_pairs(
                 gone |= {name, reversed_name}
             elif taken.setdefault(name, pair) != pair:
                 failures.append(
-                    f"{' '.join(pair)}: {' '.join(taken[name])} has the same group: rename an image"
+                    f"{' '.join(pair)}: the pair {' '.join(taken[name])} has the same group name: "
+                    "rename an image"
                 )
             else:
                 wanted[pair] = {name: state0 + state1, reversed_name: state1 + state0}
@@ -204,12 +215,12 @@ def _find_pairs(
 
 
 def _state(file: Any, name: str) -> State | None:
-    """Return numbers that change if the features of an image do, or None without features."""
+    """Return numbers that change if an image's features change, or None if it lacks features."""
     try:
         group = file[name]
         if state := state_of(group):
             return state
-        # Files of other programs have no state.
+        # Files of other programs store no state, so the features themselves are compared.
         digest = key(group["keypoints"][()], group["descriptors"][()])
     except (KeyError, TypeError, ValueError, IndexError):
         return None
@@ -224,7 +235,7 @@ def _match_pairs(
     options: PairMatchingOptions,
 ) -> Iterator[Group]:
     with open_hdf5(features) as file:
-        first: tuple[str, Keypoints] | None = None  # pairs are sorted by their first image
+        first: tuple[str, Keypoints] | None = None  # kept: pairs are sorted by their first image
         for (name0, name1), state in pairs:
             with noted_failures(f"{name0} {name1}", failures):
                 if first is None or first[0] != name0:
@@ -232,7 +243,9 @@ def _match_pairs(
                 features0, features1 = first[1], read_keypoints(file, name1)
                 both = features0.descriptors, features1.descriptors
                 if len({np.asarray(each).shape[-1:] for each in both}) > 1:
-                    raise InvalidFileError("their descriptors differ in type: extract both anew")
+                    raise InvalidFileError(
+                        "their descriptors are of different types: extract both again"
+                    )
                 rows, scores = _match(features0, features1, options)
                 counts[name0, name1] = len(rows)
                 yield match_group((name0, name1), len(features0), rows, scores, state)
@@ -241,7 +254,11 @@ def _match_pairs(
 def match_group(
     pair: Pair, count: int, rows: np.ndarray, scores: np.ndarray, state: State = ()
 ) -> Group:
-    """Return hloc's group of (K, 2) matched rows for a first image with `count` keypoints."""
+    """Return the group of a pair's matches in hloc's layout.
+
+    `rows` (K, 2) are the indices of matching keypoints in the first and second image, `scores` (K,)
+    their scores, and `count` is the number of keypoints of the first image.
+    """
     matches0, scores0 = np.full(count, -1, np.int32), np.zeros(count, np.float32)
     matches0[rows[:, 0]], scores0[rows[:, 0]] = rows[:, 1], scores
     return Group(pair_name(*pair), {"matches0": matches0, "matching_scores0": scores0}, state)

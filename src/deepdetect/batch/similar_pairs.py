@@ -1,7 +1,7 @@
 """Search for the most similar images of a collection, by their features.
 
-Images are compared by VLAD (Jégou et al., "Aggregating local descriptors into a compact image
-representation", 2010) of their best keypoints, with a vocabulary of the collection itself.
+Each image is described by VLAD (Jégou et al., "Aggregating local descriptors into a compact image
+representation", 2010) of its best keypoints. The vocabulary is trained on the collection itself.
 """
 
 from __future__ import annotations
@@ -22,18 +22,20 @@ from .hdf5 import open_hdf5
 from .pair_list import Pair
 
 COMPARED_KEYPOINTS = 512
-"""Images are compared by this number of their best keypoints. Chosen by hand."""
+"""An image is described by at most this number of its best keypoints. Chosen by hand."""
 
 WORDS, DESCRIPTORS_OF_WORD = 64, 8
-"""The vocabulary has the first number of words, or fewer if each would have fewer than the second
-number of descriptors. Chosen by hand."""
+"""The vocabulary has `WORDS` words. It has fewer if there are fewer than `DESCRIPTORS_OF_WORD`
+training descriptors per word. Chosen by hand."""
 
 KMEANS_ITERATIONS = 10
 TRAINING_IMAGES, TRAINING_DESCRIPTORS = 500, 50_000
-"""The vocabulary is trained on at most these numbers of images and descriptors, to save time."""
+"""The vocabulary is trained on at most these total numbers of images and descriptors, to save
+time."""
 
 COMPARED_ROWS = 256
-"""This many images are compared with all others at once: 300 MB for a total of 100,000 images."""
+"""The vectors of this many images are compared at once with those of all images, which takes 300 MB
+of memory for a collection of 100,000 images."""
 
 
 def similar_pairs(
@@ -42,7 +44,7 @@ def similar_pairs(
     """Find the `count` most similar images of each image.
 
     Returns every pair once, and a sentence on each image whose descriptors are missing, damaged, or
-    of another type than the others. Images without keypoints are left out silently.
+    of another type than those of most images. Images without keypoints are left out silently.
     """
     failures: dict[str, str] = {}
     blank: set[str] = set()
@@ -65,7 +67,9 @@ def similar_pairs(
 
         vectors, rows = vlad_vectors(len(names), descriptors, seed, bar.update)
     for name in {*names} - blank - {names[row] for row in rows}:
-        failures.setdefault(name, f"{name}: its descriptors differ from others: extract all anew")
+        failures.setdefault(
+            name, f"{name}: its descriptors are of another type than most: extract all images again"
+        )
     pairs: set[tuple[int, int]] = set()
     with progress(len(rows), "comparing", "image", quiet) as bar:
         for k, alike in enumerate(most_alike(vectors, count)):
@@ -80,11 +84,11 @@ def vlad_vectors(
     seed: int = 0,
     done: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Describe each image by one vector: VLAD with the sum of each word normalised to length 1.
+    """Describe each image by a VLAD vector, in which each word's sum of residuals has unit length.
 
-    `descriptors` returns the descriptors of an image, (N_i, D) float32 of length 1. Returns vectors
-    (M, WORDS * D) of length 1, and the rows (M,) of their images. Images without descriptors, or
-    with another D than most images, are left out.
+    `descriptors(i)` returns the descriptors of image i, (N_i, D) float32 of unit length. Returns
+    (M, words * D) vectors of unit length, and the (M,) indices of their images. Images without
+    descriptors, or with another D than most images, are left out.
     """
     rng = np.random.default_rng(seed)
     described = (own for k in rng.permutation(count).tolist() if len(own := descriptors(k)))
@@ -109,7 +113,7 @@ def vlad_vectors(
 
 
 def most_alike(vectors: np.ndarray, count: int) -> Iterator[np.ndarray]:
-    """Yield, for each vector, the rows of the `count` others with the largest dot products."""
+    """Yield, for each vector, the indices of the `count` others with the largest dot products."""
     last = min(count, len(vectors) - 1)
     for start in range(0, len(vectors), COMPARED_ROWS):
         apart = -vectors[start : start + COMPARED_ROWS] @ vectors.T

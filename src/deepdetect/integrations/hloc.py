@@ -1,6 +1,7 @@
 """hloc (Hierarchical-Localization): an extractor, a matcher of features, and a dense matcher.
 
-After `register()`, hloc knows them by the name "deepdetect".
+After `register()`, hloc knows the extractor and the matcher of features by the name "deepdetect",
+and the dense matcher by the name "deepdetect_dense".
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from torch import Tensor
 NAME = "deepdetect"
 
 MAX_KEYPOINTS = np.iinfo(np.int16).max
-"""Maximum number of keypoints: hloc stores the keypoint indices of matches as int16."""
+"""Maximum number of keypoints of an image, because hloc stores keypoint indices as int16."""
 
 EXTRACTOR_CONF: dict[str, Any] = {
     "output": "feats-deepdetect-n4096",
@@ -54,11 +55,11 @@ DENSE_MATCHER_CONF: dict[str, Any] = {
     "cell_size": 8,
 }
 """Configuration for `hloc.match_dense.main`. hloc merges match positions in cells of `cell_size`
-pixels into keypoints, to which matches up to `max_error` pixels away are then assigned."""
+pixels into one keypoint each. It assigns matches to keypoints up to `max_error` pixels away."""
 
 
 class DeepDetectExtractor(BaseModel):
-    """Extractor of the best keypoints of all scales with descriptors, for `hloc.extract_features`.
+    """Extractor of the best keypoints of all scales and descriptors, for `hloc.extract_features`.
 
     The options `max_keypoints`, `spread` and `descriptor` are those of `PointDetector`; hloc's
     LightGlue needs the descriptor "rootsift". `angle_unit` is the unit of `oris`: "degrees" as in
@@ -105,9 +106,9 @@ class DeepDetectMatcher(BaseModel):
     """Nearest-neighbour matcher with the ratio test, for `hloc.match_features`.
 
     The options `ratio` and `mutual` are those of `match_features`. It matches the features of any
-    extractor whose descriptors are compared by Euclidean distance. With `descriptor` "learned",
-    features must be those of `DeepDetectExtractor` with `oris` in degrees; the rotation between
-    the images is then taken into account, which finds more matches.
+    extractor whose descriptors are compared by Euclidean distance. If `descriptor` is "learned",
+    the features must be those of `DeepDetectExtractor` with `oris` in degrees. The matcher then
+    finds more matches, because it takes the rotation between the images into account.
     """
 
     default_conf: dict[str, Any] = {  # noqa: RUF012
@@ -156,8 +157,8 @@ class DeepDetectMatcher(BaseModel):
 class DeepDetectDenseMatcher(BaseModel):
     """Dense guided matcher of two images, for `hloc.match_dense`.
 
-    With the option `max_keypoints`, a `PointDetector` is used, otherwise a `DeepDetect` with the
-    option `weights`. Without a trusted geometry there are no matches.
+    If the option `max_keypoints` is set, it uses a `PointDetector`, otherwise a `DeepDetect` with
+    the option `weights`. If no geometry can be trusted, it returns no matches.
     """
 
     default_conf: dict[str, Any] = {"weights": "default", "max_keypoints": None}  # noqa: RUF012
@@ -171,7 +172,8 @@ class DeepDetectDenseMatcher(BaseModel):
         )
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
-        # hloc expects refined positions in the first image; ours are refined in the second.
+        # The images are swapped, because hloc expects refined positions in the first image, and
+        # `match_images` refines those in the second.
         second, first = (load_tensor(data[name][0]) for name in ("image1", "image0"))
         matches = match_images(second, first, self._detector)
         arrays = {

@@ -17,15 +17,15 @@ from torch import Tensor
 from torch.nn import Module
 
 LAF_SCALE_PER_SIZE = 3.0
-"""Scale of a local affine frame (LAF) divided by the keypoint's diameter, which is 2 sigma. The
-scale is half the side of the described patch, 6 sigma as in SIFT."""
+"""Ratio of the scale of a local affine frame (LAF) to the keypoint's diameter, which is 2 sigma.
+The scale is half the side of the described patch, and 6 sigma as in SIFT."""
 
 
 class DeepDetectDetector(Module):
     """Detector of the best keypoints of all scales, for `kornia.feature.LocalFeature`.
 
-    It replaces `kornia.feature.ScaleSpaceDetector`; kornia describes the keypoints. Gradients do
-    not pass through it.
+    It replaces `kornia.feature.ScaleSpaceDetector`; kornia computes the descriptors. Gradients do
+    not pass through the detector.
 
     Args:
         detector: the detector. Default: `PointDetector()`.
@@ -46,8 +46,8 @@ class DeepDetectDetector(Module):
             mask: (B, 1, H, W), above 0 where keypoints are allowed.
 
         Returns:
-            (B, N, 2, 3) LAFs and (B, N) scores, best first. N is the largest number of keypoints of
-            an image; the others are padded with LAFs and scores of 0, as in kornia.
+            (B, N, 2, 3) LAFs and (B, N) scores, best first. N is the largest number of keypoints in
+            an image; other images are padded with LAFs and scores of 0, as in kornia.
 
         Raises:
             ImageError: an image has a wrong shape, type or range, or is too small.
@@ -64,7 +64,7 @@ class DeepDetectDetector(Module):
         if not len(points):
             return torch.zeros(0, 2, 3)
         scales = torch.from_numpy(LAF_SCALE_PER_SIZE * points.sizes).view(1, -1, 1, 1)
-        # Angles grow counterclockwise in kornia, clockwise in OpenCV and here.
+        # Angles grow counterclockwise in kornia, clockwise in OpenCV and DeepDetect.
         angles = torch.from_numpy(-points.angles).view(1, -1, 1)
         lafs: Tensor = laf_from_center_scale_ori(torch.from_numpy(points.xy)[None], scales, angles)
         return lafs[0]
@@ -73,8 +73,8 @@ class DeepDetectDetector(Module):
 class DeepDetectFeature(DeepDetectDetector):
     """Detector of the best keypoints with descriptors, for `kornia.feature.LocalFeatureMatcher`.
 
-    It replaces `kornia.feature.LocalFeature`; the detector describes its keypoints. Arguments and
-    errors are those of `DeepDetectDetector`.
+    It replaces `kornia.feature.LocalFeature`; the descriptors are those of the `PointDetector`.
+    Arguments and errors are those of `DeepDetectDetector`.
     """
 
     def forward(  # type: ignore[override]  # as kornia's features differ from its detectors
@@ -87,7 +87,7 @@ class DeepDetectFeature(DeepDetectDetector):
 
         Returns:
             (B, N, 2, 3) LAFs and (B, N) scores as in `DeepDetectDetector`, and (B, N, D)
-            descriptors of unit length, with 64 learned numbers or 128 of RootSIFT.
+            descriptors of unit length: D is 64 for learned descriptors and 128 for RootSIFT.
         """
         found = _found(self._detector.extract, img, mask)
         descriptors = [

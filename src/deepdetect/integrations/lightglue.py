@@ -1,7 +1,7 @@
 """LightGlue: an extractor that replaces its SIFT extractor.
 
-The features suit `LightGlue(features="sift")` of the packages lightglue and kornia. Its weights are
-not ours and have licences of their own.
+The features suit `LightGlue(features="sift")` of the packages lightglue and kornia. The weights of
+LightGlue are not part of DeepDetect, and have licences of their own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from torch.nn import Module
 Scale = Literal["diameter", "sigma"]
 
 MAX_KEYPOINTS = 4096
-"""LightGlue's time and memory grow with the square of this; its SIFT extractor has this limit."""
+"""Maximum number of keypoints, as in LightGlue's own SIFT extractor, because LightGlue's time and
+memory grow with the square of it."""
 
 
 class DeepDetectExtractor(Module):
@@ -31,7 +32,7 @@ class DeepDetectExtractor(Module):
 
     Args:
         detector: detector of at most 4,096 points with RootSIFT, for which LightGlue has weights.
-        scale: as in `Keypoints.to_lightglue`.
+        scale: meaning of "scales", "diameter" or "sigma", as in `Keypoints.to_lightglue`.
 
     Raises:
         OptionError: an option is unknown or out of its range.
@@ -65,7 +66,7 @@ class DeepDetectExtractor(Module):
         """Detect and describe keypoints.
 
         Args:
-            img: (3, H, W), (1, H, W) or (1, C, H, W) tensor in [0, 1], RGB; or anything that
+            img: RGB or grey tensor in [0, 1], (C, H, W) or (1, C, H, W); or anything that
                 `load_image` accepts, such as a path.
 
         Returns:

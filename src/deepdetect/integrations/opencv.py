@@ -21,10 +21,10 @@ from ..io.image import load_image
 
 
 class DeepDetectFeature2D:
-    """The best keypoints of all scales, with descriptors, by the interface of `cv2.SIFT`.
+    """Detector and descriptor of the best keypoints of all scales, which replaces `cv2.SIFT`.
 
-    It has the methods of `cv2.Feature2D` but is no subclass of it, since Python subclasses crash
-    the interpreter. Functions of OpenCV that need a `cv2.Feature2D` therefore reject it.
+    It has the methods of `cv2.Feature2D` but is not a subclass, because a subclass in Python would
+    crash the interpreter. Functions of OpenCV that need a `cv2.Feature2D` therefore reject it.
 
     Args:
         detector: the detector, which also computes descriptors. Default: `PointDetector()`.
@@ -70,16 +70,17 @@ class DeepDetectFeature2D:
     def compute(
         self, image: Any, keypoints: Sequence[cv2.KeyPoint], descriptors: None = None
     ) -> tuple[tuple[cv2.KeyPoint, ...], np.ndarray | None]:
-        """Describe keypoints of this detector or others.
+        """Describe keypoints of this or any other detector.
 
         Args:
             image: as in `detect`.
-            keypoints: keypoints with sizes; angles of -1 are estimated.
-            descriptors: not used; OpenCV has this argument.
+            keypoints: keypoints with sizes. An angle of -1 is unknown, and is estimated.
+            descriptors: not used, but an argument in OpenCV.
 
         Returns:
-            The same keypoints and (N, D) float32 descriptors, or None without keypoints, as in
-            OpenCV. Descriptors are 64 learned numbers, or for RootSIFT 128 integers in [0, 255].
+            The same keypoints, and (N, D) float32 descriptors, which are None if there are no
+            keypoints, as in OpenCV. A learned descriptor has 64 numbers; RootSIFT has 128 integers
+            in [0, 255].
         """
         rgb = self._load(image)
         points = Keypoints.from_opencv(keypoints, (rgb.shape[1], rgb.shape[0]))
@@ -97,27 +98,27 @@ class DeepDetectFeature2D:
         """Detect and describe keypoints: `detect` and `compute` in one.
 
         Raises:
-            OptionError: `useProvidedKeypoints` is set: `compute` describes given keypoints.
+            OptionError: `useProvidedKeypoints` is set. Use `compute` to describe given keypoints.
         """
         if useProvidedKeypoints:
-            raise OptionError("`useProvidedKeypoints` is not supported: use the method compute")
+            raise OptionError("`useProvidedKeypoints` is not supported: use the method `compute`")
         points = self._detector.extract(self._load(image), ignore=_ignored(mask))
         return _to_opencv(points), _as_float(points) if len(points) else None
 
     def descriptorSize(self) -> int:
-        """Return the length of a descriptor."""
+        """Return the number of values in a descriptor."""
         return 128 if self._detector.descriptor_type == ROOT_SIFT else LENGTH
 
     def descriptorType(self) -> int:
-        """Return the type of descriptors, float32 as in `cv2.SIFT`."""
+        """Return OpenCV's number of the type of descriptors, float32 as in `cv2.SIFT`."""
         return cv2.CV_32F
 
     def defaultNorm(self) -> int:
-        """Return the norm that compares descriptors, for `cv2.BFMatcher`."""
+        """Return OpenCV's number of the norm that compares descriptors, for `cv2.BFMatcher`."""
         return cv2.NORM_L2
 
     def empty(self) -> bool:
-        """Return False, which in OpenCV means that the detector is ready."""
+        """Return False, which in OpenCV means that the detector can be used."""
         return False
 
     def getDefaultName(self) -> str:
@@ -134,7 +135,7 @@ def _ignored(mask: np.ndarray | None) -> np.ndarray | None:
 
 
 def _to_opencv(points: Keypoints) -> tuple[cv2.KeyPoint, ...]:
-    """Convert keypoints; add the octaves at which SIFT describes keypoints of their sizes."""
+    """Convert keypoints to OpenCV's, with the octaves in which SIFT describes their sizes."""
     assert points.sizes is not None
     octaves = packed_octaves(points.sizes, points.image_size)
     return tuple(dataclasses.replace(points, octaves=octaves).to_opencv())

@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     import torch
 
 OVERSHOOT = 0.25
-"""Tensors may exceed [0, 1] by this much, because bicubic filters overshoot. They are clipped."""
+"""The values of a tensor may lie outside [0, 1] by at most this, because bicubic filters overshoot.
+They are clipped."""
 
 
 def load_tensor(image: Any) -> np.ndarray:
-    """Read an image as `load_image` does; tensors may exceed [0, 1] a little."""
+    """Read an image as `load_image` does; clip values of a tensor slightly outside [0, 1]."""
     if hasattr(image, "detach") and image.is_floating_point():
         image = image.detach().float().cpu().numpy()
         if image.size and image.min() >= -OVERSHOOT and image.max() <= 1 + OVERSHOOT:
@@ -26,7 +27,7 @@ def load_tensor(image: Any) -> np.ndarray:
 
 
 def padded(rows: Sequence[Any], device: torch.device) -> torch.Tensor:
-    """Combine arrays or tensors of different lengths in one tensor, padded with zeros."""
+    """Stack arrays or tensors of different lengths into one tensor; pad the ends with zeros."""
     import torch
 
     tensors = [torch.as_tensor(values) for values in rows]

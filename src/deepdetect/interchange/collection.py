@@ -1,4 +1,4 @@
-"""Images with their keypoints and matches, from which all formats are written."""
+"""Images with their keypoints and matches, from which the files of other programs are written."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class PairMatches:
     """Matches of two images.
 
     Attributes:
-        rows: (K, 2) int32 rows of keypoints of the first and second image, each at most once.
+        rows: (K, 2) int32 indices of matching keypoints in the first and the second image. Each
+            keypoint has at most one match.
         scores: (K,) float32 in [0, 1], higher is better.
     """
 
@@ -31,7 +32,7 @@ class PairMatches:
 
     @classmethod
     def one_to_one(cls, rows: np.ndarray, scores: np.ndarray) -> PairMatches:
-        """Keep the best match of each keypoint; rows below 0 mean no keypoint.
+        """Keep only the best match of each keypoint; leave out rows with an index below 0.
 
         Example:
             >>> PairMatches.one_to_one([[0, 5], [1, 5], [2, -1], [3, 0]], [.2, .9, 1, .5]).rows
@@ -56,8 +57,8 @@ class Collection:
     """Images with their keypoints and matches.
 
     Attributes:
-        keypoints: keypoints by name of the image, which is its path below `folder`, with "/".
-        matches: matches by the names of two images.
+        keypoints: keypoints by image name, which is the image's path below `folder`, with "/".
+        matches: matches by pair of image names.
         folder: folder of the images, if known.
         failures: a sentence on each image or pair that could not be processed.
 
@@ -76,24 +77,24 @@ class Collection:
                 if name not in self.keypoints:
                     raise OptionError(
                         f"the matches of {pair[0]} and {pair[1]} need the keypoints of {name}, "
-                        "which are missing: also give its features"
+                        "which are missing: also give the features of that image"
                     )
                 most = int(found.rows[:, side].max(initial=-1))
                 if most >= len(self.keypoints[name]):
                     raise OptionError(
                         f"the matches of {pair[0]} and {pair[1]} refer to keypoint {most} of "
-                        f"{name}, which has {len(self.keypoints[name])}: give the features that "
-                        "were matched"
+                        f"{name}, which has only {len(self.keypoints[name])}: give the features "
+                        "that were matched"
                     )
 
     def path(self, name: str) -> Path | None:
-        """Return the file of an image, or None if it is unknown or missing."""
+        """Return the path of an image, or None if the folder is unknown or the file missing."""
         path = None if self.folder is None else self.folder / name
         return path if path is not None and path.is_file() else None
 
 
 def describe_collection(collection: Collection, quiet: bool = True) -> Collection:
-    """Add RootSIFT descriptors to keypoints without descriptors, if their image is known.
+    """Add RootSIFT descriptors to keypoints without descriptors, if their image is available.
 
     Keypoints without sizes and angles are described upright, with a diameter of 3 pixels.
 
@@ -114,8 +115,8 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
             if gray.shape[::-1] != points.image_size:
                 raise ImageError(
                     f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels, but its keypoints are of "
-                    f"an image of {points.image_size[0]}x{points.image_size[1]}: name the folder "
-                    "of the images that they were found in"
+                    f"an image of {points.image_size[0]}x{points.image_size[1]}: give the folder "
+                    "of the images in which they were found"
                 )
             described[name] = describe_keypoints(gray, points)
             bar.update()
@@ -123,10 +124,10 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Raise an OptionError for names with blanks, which separate the names in a list."""
+    """Raise an OptionError if a name contains blanks, because blanks separate names in a list."""
     for name in names:
         if len(name.split()) != 1:
-            raise OptionError(f"lists of this format separate names by blanks: rename {name!r}")
+            raise OptionError(f"this format separates image names by blanks: rename {name!r}")
 
 
 def check_upright(paths: Iterable[Path]) -> None:

@@ -1,4 +1,4 @@
-"""Files of COLMAP: a database, or text files. `sfm.colmap` describes the units."""
+"""Files of COLMAP: a database, or text files. `sfm.colmap` describes coordinates and units."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .collection import Collection, check_names
 
 MATCHES_NAME = "matches"
 DEFAULT_SIZE_PX = 3.0
-"""Keypoints without a size get this diameter, that of dense keypoints."""
+"""Keypoints without a size get this diameter, with which dense keypoints are described."""
 
 
 @suggest_keywords
@@ -34,13 +34,13 @@ def write_colmap(
     intrinsics: Mapping[str, CameraIntrinsics],
     verify: bool = True,
 ) -> tuple[Path, ...]:
-    """Write a COLMAP database, whole or not at all; an existing file is replaced.
+    """Write a COLMAP database, complete or not at all; an existing file is replaced.
 
     Args:
         collection: the images.
         output: path that ends in .db.
-        intrinsics: camera of each image; images with the same object share a camera.
-        verify: estimate the two-view geometry of each pair, which COLMAP needs for mapping.
+        intrinsics: camera of each image, by name. Images with the same object share a camera.
+        verify: estimate the two-view geometry of each pair, which COLMAP's mapper needs.
 
     Returns:
         The file.
@@ -70,8 +70,9 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
     """Write text files for `colmap feature_importer` and `colmap matches_importer`.
 
     Args:
-        collection: the images, whose keypoints have SIFT descriptors.
-        output: folder: NAME.txt for each image, and matches.txt (`--match_type raw`).
+        collection: the images, whose keypoints must have SIFT descriptors.
+        output: folder, in which each image gets a file NAME.txt. The matches are written to
+            matches.txt, which `colmap matches_importer --match_type raw` reads.
 
     Returns:
         The files.
@@ -93,7 +94,7 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
         if descriptors is None:
             raise OptionError(
                 f"the keypoints of {name} have no SIFT descriptors, which COLMAP's text files "
-                "need: name the folder of the images as `images`, or write a database"
+                "need: give the folder of the images as `images`, or write a database"
             )
         sizes = np.full(len(points), DEFAULT_SIZE_PX) if points.sizes is None else points.sizes
         frames = np.column_stack([points.xy + PIXEL_CENTRE, sizes / 2, orientations_of(points)])

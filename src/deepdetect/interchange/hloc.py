@@ -1,6 +1,7 @@
 """Files of hloc: features, matches and pairs, in float32 and int32.
 
-Pixel coordinates are the same as here: hloc itself adds the half pixel for COLMAP.
+hloc's pixel coordinates are the same as DeepDetect's. hloc itself adds the half pixel by which
+those of COLMAP differ.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ FILES = ("features.h5", "matches.h5", "pairs.txt")
 
 
 def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
-    """Write features.h5 (keypoints, scores, descriptors (D, N)), matches.h5 and pairs.txt.
+    """Write features.h5 (keypoints, scores and descriptors), matches.h5 and pairs.txt.
 
-    They are the arguments of `hloc.reconstruction.main`. Each file appears whole, or not at all.
+    The three files are arguments of `hloc.reconstruction.main`. Each file appears complete or not
+    at all. The descriptors of an image have the shape (D, N).
 
     Args:
         collection: the images; hloc needs descriptors for matching, not for mapping.
@@ -31,8 +33,8 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         The files. Without matches, matches.h5 and pairs.txt are not written.
 
     Raises:
-        OptionError: two pairs would have the same group in the file, a name in the list of pairs
-            has a blank, or an image is rotated by EXIF.
+        OptionError: two pairs would have the same group name, a name in the list of pairs has a
+            blank, or an image is rotated by EXIF.
         DeepDetectError: a file cannot be written.
         MissingExtraError: h5py is not installed.
     """
@@ -45,7 +47,8 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         other = taken.setdefault(pair_name(*pair), pair)
         if other != pair:
             raise OptionError(
-                f"{' '.join(pair)} and {' '.join(other)} have the same group: rename an image"
+                f"the pairs {' '.join(pair)} and {' '.join(other)} have the same group name: "
+                "rename an image"
             )
     keypoints = collection.keypoints
     write_groups(features, (feature_group(name, points) for name, points in keypoints.items()))

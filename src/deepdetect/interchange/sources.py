@@ -1,4 +1,4 @@
-"""Collections from files that the commands `extract`, `match-many`, `detect` and `match` write."""
+"""Collections from a folder of images, or from keypoints and matches in files."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from ..io.tables import load_keypoints, load_matches
 from .collection import Collection, PairMatches
 
 MAX_ALL_PAIRS = 50
-"""If no pairs are given, all pairs of up to this number of images are matched. Chosen by hand."""
+"""If no pairs are given, all pairs of at most this number of images are matched. Chosen by hand."""
 
 MATCHES_SUFFIX = "_matches"
-"""Names of files of `deepdetect match` have this ending."""
+"""The names of NPZ files written by `deepdetect match` end with this, before the suffix."""
 
 
 @suggest_keywords
@@ -38,17 +38,18 @@ def read_collection(
     """Read saved keypoints and matches.
 
     Args:
-        files: one HDF5 file of `deepdetect extract` or hloc; or npz files of `deepdetect detect`
-            (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz).
-        matches: HDF5 file of `deepdetect match-many` or hloc.
-        images: folder of the images, which is also used to complete the names of npz files.
+        files: one HDF5 file written by `deepdetect extract` or hloc; or npz files written by
+            `deepdetect detect` (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz).
+        matches: HDF5 file written by `deepdetect match-many` or hloc.
+        images: folder of the images. It also serves to find the images that npz files name only by
+            their stems.
 
     Returns:
-        The collection. Matches of npz files are the inliers of their geometry, at the positions of
-        the keypoints, so that matches of several pairs form tracks.
+        The collection. It takes from npz files only the matches that are inliers of the geometry.
+        They join keypoints, not refined positions, so that matches of several pairs form tracks.
 
     Raises:
-        DeepDetectError: a file is missing or has other contents, or names do not agree.
+        DeepDetectError: a file is missing or of another kind, or the names of images do not agree.
         MissingExtraError: h5py is not installed.
     """
     paths = [Path(path) for path in files]
@@ -64,29 +65,29 @@ def read_collection(
     found = {} if matches is None else read_matches_file(Path(matches), keypoints)
     if folder is not None and not any((folder / name).is_file() for name in keypoints):
         raise OptionError(
-            f"{folder} has none of the images of {paths[0]}, such as {next(iter(keypoints))}: name "
-            "the folder that they were extracted from as `images`"
+            f"{folder} has none of the images of {paths[0]}, such as {next(iter(keypoints))}: give "
+            "the folder from which the features were extracted as `images`"
         )
     return Collection(keypoints, found, folder)
 
 
 def read_features_file(path: Path) -> dict[str, Keypoints]:
-    """Read all features of an HDF5 file in hloc's layout, by name of the image."""
+    """Read all features of an HDF5 file in hloc's layout; return them by image name."""
     with open_hdf5(path) as file:
         found = {name: read_keypoints(file, name) for name in sorted(feature_names(file))}
     if not found:
-        raise InvalidFileError(f"{path} has no features: give a file of deepdetect extract")
+        raise InvalidFileError(f"{path} has no features: give a file written by deepdetect extract")
     return found
 
 
 def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pair, PairMatches]:
     """Read all matches of these keypoints from an HDF5 file in hloc's layout.
 
-    The file has "-" for "/" in the names of images.
+    In the file, the names of images have "-" instead of "/".
 
     Raises:
         DeepDetectError: the file is missing, damaged or without matches, its names are ambiguous,
-            or its matches are of other keypoints.
+            or its matches belong to other keypoints.
     """
     known: dict[str, list[str]] = {}
     for name in keypoints:
@@ -103,15 +104,15 @@ def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pa
                     if len(known.get(written, ())) != 1:
                         reason = "several" if written in known else "none"
                         raise InvalidFileError(
-                            f"{path} has matches of {written}, a name that {reason} of the images "
-                            "with features have: give the features that were matched"
+                            f"{path} has matches of {written}, a name that fits {reason} of the "
+                            "images with features: give the features that were matched"
                         )
                     pair.append(known[written][0])
                 rows1 = np.asarray(group["matches0"][()], np.int64)
                 count = len(keypoints[pair[0]])
                 if rows1.shape != (count,):
                     raise InvalidFileError(
-                        f"{path} has matches of {rows1.size} keypoints of {pair[0]}, which has "
+                        f"{path} has matches of {rows1.size} keypoints of {pair[0]}, but it has "
                         f"{count}: give the features that were matched"
                     )
                 rows0 = np.flatnonzero(rows1 >= 0)
@@ -120,12 +121,14 @@ def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pa
                 rows = np.column_stack([rows0, rows1[rows0]])
                 _add_matches(found, (pair[0], pair[1]), PairMatches.one_to_one(rows, kept))
     if not found:
-        raise InvalidFileError(f"{path} has no matches: give a file of deepdetect match-many")
+        raise InvalidFileError(
+            f"{path} has no matches: give a file written by deepdetect match-many"
+        )
     return found
 
 
 def _add_matches(found: dict[Pair, PairMatches], pair: Pair, matches: PairMatches) -> None:
-    """Add the matches of a pair, and join them with those of the pair in the other order."""
+    """Add the matches of a pair to `found`; merge them with those of the reversed pair, if any."""
     other = found.get(pair[::-1])
     if other is None:
         found[pair] = matches
@@ -143,7 +146,9 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
         if not path.stem.endswith(MATCHES_SUFFIX):
             name = path.stem if names is None else _name_of(path, names)
             if name in keypoints:
-                raise OptionError(f"two files belong to {name}: give the image folder as `images`")
+                raise OptionError(
+                    f"two files belong to {name}: give the folder of the images as `images`"
+                )
             keypoints[name] = load_keypoints(path)
             continue
         loaded = load_matches(path)
@@ -152,8 +157,8 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
             before = keypoints.setdefault(name, own)
             if not (np.array_equal(before.xy, own.xy) and before.image_size == own.image_size):
                 raise InvalidFileError(
-                    f"{path} differs from other files in the keypoints of {name}: use the same "
-                    "options for all"
+                    f"{path} has other keypoints of {name} than the other files: write all with "
+                    "the same options"
                 )
         kept = loaded.inliers
         rows = np.column_stack([loaded.indices0[kept], loaded.indices1[kept]])
@@ -162,7 +167,11 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
 
 
 def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
-    """Map paths and unique stems of images, which may be names of npz files, to image names."""
+    """Map the names that an npz file may use for an image to the image's name.
+
+    They are its path below the folder with or without suffix, and its stem. Those that fit several
+    images are left out. Returns None without a folder.
+    """
     if folder is None:
         return None
     names: dict[str, set[str]] = {}
@@ -174,12 +183,15 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
 
 
 def _name_of(path: Path, names: Mapping[str, str]) -> str:
-    """Return the image whose path has the longest end in common with that of an npz file."""
+    """Return the image name that belongs to the longest known end of an npz file's path."""
     parts = path.with_suffix("").parts
     for first in range(len(parts)):
         if (key := "/".join(parts[first:])) in names:
             return names[key]
-    raise OptionError(f"{path} belongs to no image in the folder `images`, or to several: move it")
+    raise OptionError(
+        f"{path} belongs to no image in the folder `images`, or to several: give it the name and "
+        "subfolder of the image"
+    )
 
 
 def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pair:
@@ -189,10 +201,10 @@ def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pai
         joined = [(names[a], names[b]) for a, b in joined if a in names and b in names]
     if len(joined) != 1:
         raise OptionError(
-            f"it is unclear which two images {path} is for: name their folder as `images`"
+            f"it is unclear which two images {path} is for: give their folder as `images`"
             if names is None
             else f"{path} belongs to no two images in the folder `images`, or to several pairs: "
-            "name another folder"
+            "give another folder"
         )
     return joined[0]
 
@@ -208,14 +220,14 @@ def match_folder(
 ) -> Collection:
     """Detect and match the keypoints of all images below a folder.
 
-    For large collections, use `extract_features` and `match_pairs`, which keep their results. This
-    starts processes, so a script must call it under `if __name__ == "__main__":`.
+    For large collections, use `extract_features` and `match_pairs`, which keep their results. The
+    function starts processes, so a script must call it under `if __name__ == "__main__":`.
 
     Args:
         folder: folder of the images.
         detector: a detector as in `extract_features`.
-        pairs: pairs as in `match_pairs`; None: all pairs of up to 50 images.
-        workers: number of processes; default one per processor.
+        pairs: pairs as in `match_pairs`; None: all pairs, if there are at most 50 images.
+        workers: number of processes; default: one per processor.
         quiet: show no progress bars.
 
     Returns:
@@ -231,10 +243,11 @@ def match_folder(
     names = [path.relative_to(root).as_posix() for path in find_images(root)]
     if pairs is None and len(names) > MAX_ALL_PAIRS:
         raise OptionError(
-            f"all pairs of {len(names)} images would take long: give `pairs`, such as sequential:10"
+            f"all pairs of {len(names)} images would take long: give `pairs`, such as "
+            "'sequential:10'"
         )
     pairs = "exhaustive" if pairs is None else pairs
-    list_pairs(pairs, ())  # raises an error for wrong pairs before the work
+    list_pairs(pairs, ())  # raises an error for wrong pairs before long work
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
         features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")
         extracted = extract_features(root, features, detector, workers=workers, quiet=quiet)
@@ -242,7 +255,7 @@ def match_folder(
             extracted.check()
         keypoints = read_features_file(features)
         unread = set(names) - keypoints.keys()
-        # An image that cannot be read counts as one failure, without its pairs.
+        # An unreadable image counts as one failure; its pairs are not further failures.
         wanted = list_pairs(pairs, [name for name in names if name in keypoints])
         wanted = [pair for pair in wanted if unread.isdisjoint(pair)]
         matched = match_pairs(features, wanted, found, workers=workers, quiet=quiet)

@@ -14,31 +14,31 @@ MAX_CIRCLES = 5000
 cover the image."""
 
 LEAST_RADIUS_PX = 2.0
-"""Minimum radius of a keypoint's circle. Keypoints without a size get a radius one pixel larger.
-Chosen by hand."""
+"""Minimum radius of a keypoint's circle, in pixels. Keypoints without a size get a radius one pixel
+larger. Chosen by hand."""
 
 PICTURE_SIDE_PX = 2000
-"""Longest side of a visualisation, in pixels: as JPEG it then takes less than two megabytes."""
+"""Longest side of a visualisation, in pixels. A JPEG of it then takes less than two megabytes."""
 
 READABLE_WIDTH_PX = 800
-"""Captions, lines and points grow in proportion above this image width. Chosen by hand."""
+"""Captions, lines and points grow with the width of images wider than this. Chosen by hand."""
 
 LINES, DOTS = 60, 1500
-"""If colours show positions, the first is the maximum number of matches drawn as lines, the second
-of those drawn as points. Chosen by hand."""
+"""If colours encode positions, at most `DOTS` matches are drawn as pairs of points, and only
+`LINES` of the pairs are joined by a line. Chosen by hand."""
 
 SHOWN_PERCENTILE = 99.0
-"""Colour scales range from 100 minus this percentile to this percentile of the values, so that
+"""Colour scales end at this percentile of the values, and begin at 100 minus it (the 1st), so that
 outliers do not stretch them."""
 
 LEAST_DEPTH_LEVEL = 0.2
 """The farthest depth has this level (0 to 1) of the colour scale, because darker colours look like
-unknown depth. Chosen by hand."""
+the black of unknown depth. Chosen by hand."""
 
 CAPTION_HEIGHT = 28
 CAPTION_MARGIN = 6
 CAPTION_SCALE = 0.5
-"""Height and side margin of a caption, in pixels, and OpenCV's font scale, for images up to
+"""Height and side margin of a caption, in pixels, and its font scale in OpenCV, for images up to
 `READABLE_WIDTH_PX` wide. Chosen by hand so that captions are legible."""
 
 GAP_PX = 6
@@ -72,11 +72,12 @@ def draw_matches(
     *,
     by_position: bool = False,
 ) -> np.ndarray:
-    """Draw the two images side by side, with lines between a random sample of the matches.
+    """Draw two images side by side, with lines that join the points of a random sample of matches.
 
-    The smaller image is enlarged to the height of the other. Both are then reduced if the result
-    exceeds `PICTURE_SIDE_PX`. Good matches are green, others red. With `by_position`, the colour of
-    good matches encodes their position in the first image, and most are drawn without a line.
+    The image with the smaller height is enlarged to the height of the other. Both are then reduced
+    if the result exceeds `PICTURE_SIDE_PX`. Matches that are `good` are green, others red. With
+    `by_position`, the colour of good matches encodes their position in the first image, and most
+    matches are drawn without a line.
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
     width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))
@@ -108,7 +109,7 @@ def draw_matches(
 
 
 def _colors_of_positions(positions: np.ndarray) -> np.ndarray:
-    """Return (N, 3) RGB colours of positions in [0, 1]: hue encodes x, darkness encodes y.
+    """Return (N, 3) RGB colours of (N, 2) positions in [0, 1]: hue encodes x, darkness encodes y.
 
     Red is not used, since it marks matches that are not good.
     """
@@ -134,30 +135,30 @@ def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
 
 
 def draw_logits(logits: np.ndarray) -> np.ndarray:
-    """Colour a (H, W) map of logits, with a colour scale below it; 0 is a probability of 0.5.
+    """Colour a (H, W) map of logits, with a colour scale below it.
 
-    A map of probabilities would saturate: for a sixth of the pixels of a photograph, float32 rounds
-    the probability to 1.
+    A logit of 0 is a probability of 0.5. A map of probabilities would saturate, because float32
+    rounds the probability of a sixth of the pixels of a photograph to 1.
     """
     shown = fit_picture(np.asarray(logits, np.float32))
     known = np.where(np.isfinite(shown), shown, 0)
     low, high = shown_range(known)
     low, high = min(low, -1.0), max(high, 1.0)
     levels = np.where(np.isfinite(shown), (known - low) / (high - low), shown > 0)
-    words = "logit of a keypoint, 0 is a probability of 0.5"
+    words = "logit of a keypoint; 0 is a probability of 0.5"
     return add_scale(draw_heatmap(levels), words, low, high)
 
 
 def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
-    """Colour a (H, W) depth map, NaN where unknown, reduced by `fit_picture`, with a colour scale.
+    """Colour a (H, W) depth map, with a colour scale below it, and reduce it by `fit_picture`.
 
-    Yellow is near, dark blue is far, black is unknown.
+    Yellow is near, dark blue is far. Depth is unknown where it is NaN, which is drawn black.
     """
     known = np.isfinite(depth)
     if not known.any():
         return add_caption(np.zeros((*depth.shape, 3), np.uint8), "no depth is known")
     near, far = shown_range(depth[known])
-    # Colours are linear in inverse depth, which is what disparity shows.
+    # Colours are linear in inverse depth, as in a map of disparities.
     inverse = 1 / np.maximum(np.where(known, depth, far), 1e-9)
     levels = (inverse - 1 / far) / max(1 / near - 1 / far, 1e-12)
     colors = draw_heatmap(LEAST_DEPTH_LEVEL + (1 - LEAST_DEPTH_LEVEL) * np.clip(levels, 0, 1))
@@ -169,13 +170,13 @@ def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
 
 
 def shown_range(values: np.ndarray) -> tuple[float, float]:
-    """Return the values at both ends of the colour scale for these values (`SHOWN_PERCENTILE`)."""
+    """Return the lowest and highest value on the colour scale (see `SHOWN_PERCENTILE`)."""
     low, high = np.percentile(values, (100 - SHOWN_PERCENTILE, SHOWN_PERCENTILE))
     return float(low), float(high)
 
 
 def viridis(levels: np.ndarray) -> np.ndarray:
-    """Return the (N, 3) RGB colours of (N,) levels in [0, 1], those of `draw_heatmap`."""
+    """Return the (N, 3) RGB colours that `draw_heatmap` gives to (N,) levels in [0, 1]."""
     colors: np.ndarray = draw_heatmap(np.asarray(levels).reshape(1, -1))[0]
     return colors
 
@@ -186,7 +187,7 @@ def line_scale(picture: np.ndarray) -> float:
 
 
 def resized(picture: np.ndarray, factor: float) -> np.ndarray:
-    """Scale an image or a map; area averaging avoids aliasing when it shrinks."""
+    """Scale an image or a map by a factor; if it shrinks, area averaging avoids aliasing."""
     size = [max(1, round(side * factor)) for side in picture.shape[1::-1]]
     method = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
     return cv2.resize(picture, size, interpolation=method)
@@ -223,7 +224,7 @@ def add_scale(
 
 
 def _caption(text: str, width: int, unit: float) -> np.ndarray:
-    """Return a black strip with a line of text that fits its width; `unit` is from `line_scale`."""
+    """Return a black strip with a line of text that fits its width; `line_scale` returns `unit`."""
     strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
     room = width - round(2 * CAPTION_MARGIN * unit)
     if room <= 0:
@@ -237,7 +238,7 @@ def _caption(text: str, width: int, unit: float) -> np.ndarray:
 
 
 def join_pictures(panels: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Join images of one size, with white gaps, in rows of `columns`."""
+    """Join images of one size in a grid of `columns` columns, with white gaps."""
     height, width = panels[0].shape[:2]
     rows = -(-len(panels) // columns)
     size = rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3
