@@ -90,7 +90,10 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 
 def _degrees(value: Any, sign: Any, below: str) -> float:
-    """Convert degrees, minutes and seconds to degrees; NaN for anything else."""
+    """Convert degrees, minutes and seconds to degrees, negative if `sign` is the letter `below`.
+
+    Any other value becomes NaN.
+    """
     try:
         degrees, minutes, seconds = (_number(part) for part in value)
     except (TypeError, ValueError):
