@@ -67,7 +67,7 @@ class Metadata:
         no_data: value that means "no data" according to GDAL's tag, or None.
         profile: the ICC profile, or None.
         exif: the EXIF as an object of Pillow, or None.
-        plain: whether pixels are grey or RGB, with or without alpha, of at most 16 bits.
+        plain: whether pixels are grey, RGB or RGB with alpha, of at most 16 bits per value.
     """
 
     to_world: np.ndarray | None = None
