@@ -221,7 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _call(words: Sequence[str]) -> int:
     module = _module_of(words)
     if module is not None:
-        importlib.import_module(module)  # here, because cyclopts would hide errors
+        importlib.import_module(module)  # cyclopts' own import would hide errors
     FORMATTER.shows_all = "--help-all" in words
     meant = {"--help-all": "--help", "-": "/dev/stdin"}
     words = [meant.get(word, word) for word in words]

@@ -47,7 +47,7 @@ class From:
         more: names of the options that only --help-all shows. None: all other parameters.
         flags: flags of options that are not named like their parameter, such as
             {"focal_px": "--focal"}. "--on/--off" are the two flags of a boolean.
-        types: types of options whose parameters accept values that nobody can type in a shell.
+        types: types of options whose parameters accept values that cannot be typed in a shell.
         defaults: texts that the help shows in place of the default value.
     """
 
@@ -241,7 +241,7 @@ def result_stems(images: Mapping[str, Path]) -> dict[Path, str]:
 
 def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     """Raise an OptionError if a file would be written twice, or would replace an input."""
-    # Names cannot tell: a file has several if there are links, or if case does not matter.
+    # Comparing names does not suffice, because of links and of systems that ignore case.
     files = {(path.stat().st_dev, path.stat().st_ino) for path in inputs if path.exists()}
     seen: set[Path] = set()
     for output in outputs:

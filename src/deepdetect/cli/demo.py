@@ -43,7 +43,7 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
 
 
 def random_pixels(image: np.ndarray, count: int, generator: np.random.Generator) -> Keypoints:
-    """Draw random pixels of an image with equal probability, for comparison."""
+    """Choose `count` pixels of an image at random, as keypoints for comparison."""
     height, width = image.shape[:2]
     drawn = generator.choice(height * width, min(count, height * width), replace=False)
     xy = np.column_stack([drawn % width, drawn // width])

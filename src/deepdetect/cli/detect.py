@@ -70,7 +70,10 @@ def detect(
     cli.check_outputs([file for files in outputs.values() for file in files.values()], paths)
     mask = None if ignore is None else load_mask(ignore)
     if detector == "network" and "max_keypoints" in values:
-        cli.say("--max-keypoints takes the best pixels; --detector points finds better keypoints")
+        cli.say(
+            "--max-keypoints keeps the best pixels of the heat map; --detector points finds better "
+            "keypoints"
+        )
     work = _Work(*chosen_detector(detector, values), mask, overwrite)
     work.say_what_is_replaced(outputs)
     results: list[dict[str, Any]] = []
@@ -116,7 +119,10 @@ class _Work:
         return dict(plain(self.detector.settings | options | noted | reading_options().settings))
 
     def say_what_is_replaced(self, outputs: dict[Path, dict[str, Path]]) -> None:
-        """Raise an OptionError for results of other images; print which options have changed."""
+        """Print which options have changed since the results of these images were written.
+
+        Raise an OptionError if results of other images would be replaced.
+        """
         changed, names = [], set()
         for path, files in outputs.items():
             Outputs([*files.values()], [path], overwrite=self.overwrite).find()

@@ -22,7 +22,7 @@ from ._options import Result, command, table
 PURPOSES = {
     "all": "the fast back end, ONNX files, the demo, HEIC, raw and compressed TIFF images",
     "app": "the page in a browser",
-    "sfm": "reconstruct of three images and more, extract, match-many, export, georeferences",
+    "sfm": "reconstruct with three or more images, extract, match-many, export, georeferences",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
 """Two back ends may differ by this much in their probabilities, five times what is usual."""
@@ -66,7 +66,7 @@ def doctor(
     for check in CHECKS:
         try:
             findings += check()
-        except Exception as error:  # a broken installation may raise any
+        except Exception as error:  # a broken installation raises all kinds
             kind = "" if isinstance(error, DeepDetectError) else f"{type(error).__name__}: "
             reason = kind + first_line(error)
             findings.append(Finding(check.__name__, "problem", "does not work", reason))
@@ -81,7 +81,7 @@ def doctor(
 
 
 def packages() -> Iterator[Finding]:
-    """Report the versions of packages, and which are missing or outdated, by extra."""
+    """Report the versions of installed packages, and what is missing or outdated."""
     yield Finding("deepdetect", "ok", f"{importlib.metadata.version('deepdetect')}, {__file__}")
     yield Finding("Python", "ok", f"{platform.python_version()} on {platform.platform()}")
     lacking: dict[str, list[str]] = {}

@@ -148,7 +148,7 @@ def hloc(
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
     """Return the path of the file that marks a folder as an earlier export.
 
-    Raise an OptionError if the folder has files without it, unless they may be overwritten.
+    Raise an OptionError if the folder has other files but not this one, unless `overwrite`.
     """
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):

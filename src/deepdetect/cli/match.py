@@ -204,7 +204,9 @@ def _choose_pairs(
     paths = cli.expand_images(images, output)
     wanted = list_pairs(pairs, [*paths])
     for name in {name for pair in wanted for name in pair} - paths.keys():
-        raise OptionError(f"{name} in {pairs} is not one of the images: use its path in the folder")
+        raise OptionError(
+            f"{name} in {pairs} is not one of the images: give its path relative to the folder"
+        )
     if not wanted:
         raise OptionError("one image makes no pair: give two or more images, or a folder")
     stems = {path: stem.replace("/", "-") for path, stem in cli.result_stems(paths).items()}
@@ -348,12 +350,12 @@ def stitch(
 
     Args:
         output: File of the panorama, or a folder for it.
-        reference: Image that a flat panorama does not distort, and a curved one has in its middle.
+        reference: Image that is undistorted in a flat panorama, and in the middle of a curved one.
             [default: the one in the middle]
     """
     file = cli.output_file(output, "panorama.jpg")
     paths = [*cli.expand_images(sources, file).values()]
-    picture_suffix(file)  # fails before the work, not after it
+    picture_suffix(file)  # checks the suffix before the long work
     if reference is not None and reference not in paths:
         raise OptionError(f"--reference {reference} must be one of the images: add it to them")
     if detector == "network" and "max_keypoints" in values:

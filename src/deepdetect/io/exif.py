@@ -12,11 +12,12 @@ from ..geometry.camera import Calibration, Camera, Size
 from .image_file import file_name, is_file, open_image
 
 DIAGONAL_35MM_MM = float(np.hypot(36, 24))
-"""Diagonal of a 35 mm film frame in mm. The 35 mm equivalent focal length refers to it (CIPA)."""
+"""Diagonal of a 35 mm film frame in mm. The 35 mm equivalent focal length is defined by it
+(CIPA)."""
 
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""Length in mm by FocalPlaneResolutionUnit: inch and cm as in the standard, and mm and micrometre,
-which cameras also use."""
+"""Length in mm of the unit for each code of FocalPlaneResolutionUnit: inch and cm as in the
+standard, and mm and micrometre, which cameras also use."""
 
 TRANSPOSED = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
@@ -95,7 +96,7 @@ def _tags(image: Any) -> tuple[dict[int, Any], int]:
             # The HEIF plug-in turns images upright and resets the usual tag.
             orientation = opened.info.get("original_orientation") or exif.get(Base.Orientation, 1)
             return dict(exif.get_ifd(IFD.Exif)), int(orientation)
-    except Exception:  # Pillow raises many types; broken tags are ignored
+    except Exception:  # Pillow raises many types of errors; broken tags are ignored
         return {}, 1
 
 

@@ -169,9 +169,9 @@ def _overview(
 
 
 def _largest_slope(cloud: PointCloud) -> float:
-    """Return the tangent of half the field of view that a camera at the origin needs.
+    """Return the tangent of half the field of view in which a camera at the origin sees the cloud.
 
-    Nearly all points in front of it are then visible.
+    It shows 99% of the points in front of the camera, unless `SLOPES` limits it.
     """
     before = cloud.points[cloud.points[:, 2] > 0].astype(np.float64)
     if not len(before):

@@ -56,7 +56,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: cv2.flip(cv2.transpose(image), -1),
     8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
 }
-"""Functions that turn images upright, by their EXIF orientation."""
+"""Each EXIF orientation from 2 on has a function here that turns an image upright."""
 
 
 @suggest_keywords
@@ -158,7 +158,7 @@ def _load(
 
 
 def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
-    """Load the images of a list, tuple or batch one by one, each with its index."""
+    """Load the images of a list, tuple or batch one by one; yield the index and pixels of each."""
     batch_length(images)
     for number, image in enumerate(images):
         with image_named(number):
@@ -178,7 +178,7 @@ def batch_length(images: Images) -> int:
 
 @contextmanager
 def image_named(number: int) -> Iterator[None]:
-    """Add the image's index in its list to the messages of errors in the block."""
+    """Add the image's index in its list to the messages of errors that the block raises."""
     try:
         yield
     except (ImageError, OptionError) as error:
@@ -297,7 +297,7 @@ def orientation_of(image: Any) -> Any:
     """Return the EXIF orientation of a loaded image; a broken tag is ignored."""
     try:
         return image.getexif().get(ORIENTATION_TAG, 1)
-    except Exception:  # Pillow's readers raise many kinds
+    except Exception:  # Pillow's readers raise many kinds of errors
         return 1
 
 
@@ -309,11 +309,11 @@ def _from_pil(
 ) -> np.ndarray:
     try:
         image.load()
-    except Exception as error:  # Pillow's decoders raise many kinds
+    except Exception as error:  # Pillow's decoders raise many kinds of errors
         raise damaged_image(name, error) from None
     if image.mode.startswith(("I", "F")):
         values = deep_values(image)
-        white = 65535 if image.format == "PPM" else None  # Pillow scales PPM to this white
+        white = 65535 if image.format == "PPM" else None  # Pillow scales white to this in PPM
         return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)

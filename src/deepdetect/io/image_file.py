@@ -216,7 +216,7 @@ def open_file(source: Any, what: str = "image") -> Iterator[tuple[BinaryIO, str]
         if error.errno is None:  # from Pillow, not from the file system
             raise damaged_image(name, error) from None
         raise ImageError(f"{name} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # Pillow's decoders raise many types
+    except Exception as error:  # Pillow's decoders raise many types of errors
         raise damaged_image(name, error) from None
 
 
@@ -287,7 +287,7 @@ def _standard_input() -> bytes:
 
 
 def _check_png(file: BinaryIO, name: str) -> None:
-    """Verify the checksums of a PNG file, if it is one: Pillow skips those of the pixels."""
+    """If the file is a PNG file, verify its checksums, because Pillow skips those of the pixels."""
     if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
         kind = b""
         while kind != b"IEND":

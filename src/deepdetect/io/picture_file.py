@@ -118,7 +118,7 @@ class Metadata:
         return profile[:length] if length <= len(profile) and profile[16:20] == space else None
 
     def _exif_of(self, picture: np.ndarray) -> Any:
-        """Return the EXIF with the size of an upright picture, or None if there is no EXIF."""
+        """Return the EXIF, adapted to the size of an upright picture, or None if there is none."""
         if not self.exif:
             return None
         height, width = picture.shape[:2]
@@ -214,7 +214,7 @@ def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
     with open_file(source) as (file, _):
         if file.read(4) in TIFF_STARTS:
             (found, page), kind = _of_tiff(file), "TIFF"
-    with suppress(Exception), open_image(source) as image:  # fails for raw photographs and others
+    with suppress(Exception), open_image(source) as image:  # fails for raw photographs
         found = replace(found, profile=found.profile or image.info.get("icc_profile"))
         exif, kind = image.getexif(), image.format
         kept = _kept_exif(exif) if kind == "TIFF" else exif
@@ -233,7 +233,7 @@ def _read_place(path: Path, page: Any) -> dict[str, Any]:
     if not (tagged or any(each.is_file() for each in _world_files(path))):
         return place
     require_packages(f"the georeference of {path}", "rasterio")
-    name = str(path.absolute())  # GDAL may take `a:b` for driver and file
+    name = str(path.absolute())  # GDAL may read `a:b` as DRIVER:FILE
     if page is not None and page.index:
         name = f"GTIFF_DIR:{page.index + 1}:{name}"
     # Files that GDAL cannot read have no georeference; a bad .prj file raises a ValueError.

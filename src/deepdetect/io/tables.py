@@ -155,14 +155,14 @@ def load_matches(path: str | Path) -> Matches:
 def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
     """Yield the arrays of an npz file by name; arrays without dimensions become numbers or strings.
 
-    Errors, also those in the block, name the file and its expected content.
+    Errors, also those that the block raises, name the file and its expected content.
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             yield {name: _value(array) for name, array in arrays.items()}
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
-    except Exception as error:  # NumPy and the zip decoders raise many types
+    except Exception as error:  # NumPy and the zip decoders raise many types of errors
         missing = "it has no array " if isinstance(error, KeyError) else ""
         raise InvalidFileError(
             f"{path} contains no {content} ({missing}{first_line(error)}): write the file again"
@@ -184,7 +184,7 @@ def _format(path: str | Path) -> str:
 
 
 def _save_csv(path: str | Path, header: str, columns: list[np.ndarray]) -> None:
-    # Scores rank the keypoints, so all digits count: 9 keep any two different float32 apart.
+    # Scores rank the keypoints, so all digits count: 9 digits tell any two float32 apart.
     digits = ["%.9g" if name == "score" else "%.7g" for name in header.split(",")]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(f"{header}\n".encode())

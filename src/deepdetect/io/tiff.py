@@ -34,7 +34,8 @@ ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
 MAX_BYTES_PER_PIXEL = 256
-"""Files with more bytes per pixel are rejected, since a small file can claim any band count."""
+"""Files with more bytes per pixel are rejected, since a small file can claim to have any number of
+bands."""
 
 
 def read_tiff(
@@ -54,7 +55,7 @@ def read_tiff(
     from tifffile import TiffFile
 
     logger = logging.getLogger("tifffile")
-    if not logger.handlers:  # otherwise it writes to standard error
+    if not logger.handlers:  # otherwise tifffile writes to standard error
         logger.addHandler(logging.NullHandler())
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
@@ -74,12 +75,12 @@ def read_tiff(
             return read_tiff(filled, name, options, deep, raw)
         try:
             array = page.asarray(squeeze=False)
-        except Exception as error:  # tifffile and its decoders raise many types
+        except Exception as error:  # tifffile and its decoders raise many types of errors
             if "imagecodecs" not in str(error):
                 raise damaged_image(name, error) from None
             return _read_by_pillow(file, stored, page, name, options), 1
-        # tifffile returns the axes band planes, depth, height, width, bands within a pixel. One of
-        # the two axes of bands has length 1. The result is (height, width, bands).
+        # tifffile's axes are bands stored as planes, depth, height, width, bands stored per pixel.
+        # One of the two axes for bands has length 1. The result is (height, width, bands).
         bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
         orientation = int(page.tags.valueof(ORIENTATION, 1))
         if raw and photometric in (MIN_IS_BLACK, RGB):

@@ -113,7 +113,7 @@ class Tracker:
     def update(
         self, image: Any, *, number: int | None = None, channels: Channels = "rgb"
     ) -> TrackedFrame:
-        """Follow all points into the next frame, and begin new tracks if there are few.
+        """Follow all points into the next frame, and begin new tracks when the options say so.
 
         Args:
             image: an image as for `DeepDetect.detect`, of the same size as earlier frames.

@@ -170,7 +170,7 @@ def count_frames(path: Path) -> int:
     """Return the number of frames of a video file that can be read in sequence."""
     backend, settings = cv2.CAP_ANY, []
     if cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends():
-        # FFmpeg can leave frames undecoded, which takes a fiftieth of the time.
+        # FFmpeg can leave frames undecoded, which needs only a fiftieth of the time.
         backend, settings = cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1]
     capture = cv2.VideoCapture(str(path), backend, settings)
     frames = next(number for number in count() if not capture.grab())
