@@ -124,7 +124,7 @@ def load_matches(path: str | Path) -> Matches:
     """Read matches from the npz file that `save_matches` wrote.
 
     Returns:
-        The matches. Their `seconds` are empty, and their keypoints have no logits.
+        The matches. Their `seconds` are empty, and their keypoints have only positions and scores.
 
     Raises:
         DeepDetectError: the file is missing or has other content.
