@@ -69,7 +69,7 @@ def test_options_of_descriptors_are_for_unguided_matches(run, photos: Path) -> N
         how = ("--detector", "points", *words)
         result = run("match", photos / "left.png", photos / "right.png", *how)
         assert result.exit_code == 2
-        assert f"{words[0]} is for --unguided: add that, or leave it out" in result.stderr
+        assert f"{words[0]} is for --unguided: add that option, or leave" in result.stderr
 
 
 def test_pairs_of_a_folder_are_those_of_the_images_one_by_one(run, photos: Path) -> None:

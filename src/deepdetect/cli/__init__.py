@@ -1,4 +1,4 @@
-"""The command line `deepdetect`: its commands, grouped in modules, and their options."""
+"""The command line `deepdetect`: modules of commands, and the options that they share."""
 
 from ._app import main
 

@@ -26,7 +26,7 @@ from .._shared.errors import (
 from .._shared.progress import STDERR, fails, say
 
 NOTHING_FOUND = 3
-"""Exit code if there was no error, but nothing was found."""
+"""Exit code of a command that ran without an error but found nothing, such as no matches."""
 
 MORE = Group("More options")
 """The group of options that only --help-all shows."""
@@ -34,7 +34,7 @@ MORE = Group("More options")
 INTRODUCTION = """\
 Detect and match dense keypoints with a tiny network, and reconstruct scenes in 3D.
 
-`deepdetect COMMAND --help` shows the common options of a command, --help-all shows all.
+`deepdetect COMMAND --help` shows the common options of a command; --help-all shows all options.
 
     deepdetect detect photo.jpg
     deepdetect match left.jpg right.jpg
@@ -64,23 +64,23 @@ COMMANDS = {
         "completion": ("_app", "Print a script that completes commands and options by Tab."),
     },
 }
-"""The commands of this package by group: the module of the function, and a summary."""
+"""The commands of this package, by group. Each has the module of its function and a summary."""
 
 LAB_ENTRY_POINTS = "deepdetect.commands"
-"""Group of the entry points by which deepdetect-lab adds commands, as tables like `COMMANDS` but
-with full names of modules.
+"""deepdetect-lab adds commands by entry points of this group. Each entry point is a table like
+`COMMANDS`, but with the full names of the modules.
 
 The entry point `dev` is the table of the commands `deepdetect dev NAME`.
 """
 
 LAB_COMMANDS = ("label", "train", "train-descriptor", "dev")
-"""Commands of deepdetect-lab, for the error if it is not installed."""
+"""Commands of deepdetect-lab. If it is not installed, calling one gives an error that says so."""
 
 Commands = Mapping[str, Mapping[str, tuple[str, str]]]
 
 
 class HelpFormatter(DefaultFormatter):
-    """The help of cyclopts, but only the number of options in the group `MORE` by default."""
+    """Format help as cyclopts does, but by default only count the options in the group `MORE`."""
 
     shows_all = False
 
@@ -99,10 +99,10 @@ FORMATTER = HelpFormatter()
 
 @functools.cache
 def make_app(summaries: bool = False) -> App:
-    """Return the application, which imports the module of a command when the command is called.
+    """Return the application; it imports the module of a command only when the command is called.
 
-    With `summaries`, the help lists commands with the summaries in `COMMANDS`, otherwise with their
-    docstrings.
+    With `summaries`, the list of commands in the help shows the summaries in `COMMANDS`; otherwise
+    it shows the docstrings of the commands.
     """
     commands, development = _all_commands()
     app = App(
@@ -129,7 +129,7 @@ def make_app(summaries: bool = False) -> App:
 
 
 def _all_commands() -> tuple[Commands, Commands]:
-    """Return the commands of this package and deepdetect-lab, and those below `dev`."""
+    """Return the commands of this package and of deepdetect-lab, and those of `deepdetect dev`."""
     commands = {
         title: {name: (f"{__package__}.{module}", does) for name, (module, does) in group.items()}
         for title, group in COMMANDS.items()
@@ -142,9 +142,9 @@ def _all_commands() -> tuple[Commands, Commands]:
 
 
 def _module_of(words: Sequence[str]) -> str | None:
-    """Return the module of the called command, if any.
+    """Return the module of the command that the words call, or None if they call none.
 
-    Entry points are read only if this package has no such command, because that takes time.
+    Entry points are read only if this package has no such command, because reading takes time.
     """
     name = next((word for word in words if word != "dev"), "")
     if words[:1] != ["dev"]:
@@ -221,7 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _call(words: Sequence[str]) -> int:
     module = _module_of(words)
     if module is not None:
-        importlib.import_module(module)  # cyclopts would hide errors of the import
+        importlib.import_module(module)  # cyclopts' own import would hide errors
     FORMATTER.shows_all = "--help-all" in words
     meant = {"--help-all": "--help", "-": "/dev/stdin"}
     words = [meant.get(word, word) for word in words]
@@ -239,9 +239,10 @@ def _failed(text: str, code: int) -> int:
 
 
 def with_flags(message: str, words: Sequence[str]) -> str:
-    """Replace the names of parameters in a message of the library by a command's options.
+    """In a message of the library, replace the names of parameters by the command's options.
 
-    Parameters are words with an underscore, or words in backticks, alone or with a value.
+    A word is taken for a parameter if it has an underscore or is in backticks. In backticks it may
+    have a value.
 
     Example:
         >>> with_flags("set nms_radius, or `pictures=False`", ["detect"])

@@ -16,7 +16,11 @@ from ._options import From
 
 Kind = Literal["network", "points"]
 Detector = Annotated[
-    Kind, Parameter(help="network: pixels of its heat map; points: ranked points of all scales.")
+    Kind,
+    Parameter(
+        help="'network' selects pixels of the network's heat map; 'points' ranks points of all "
+        "scales and takes the best."
+    ),
 ]
 
 NETWORK = From(
@@ -28,7 +32,7 @@ NETWORK = From(
 )
 POINTS = From(PointDetector, more="spread ranker")
 ONE_THREAD = replace(NETWORK, defaults={"threads": "1"})
-"""Options of the network for commands that run a detector in each process."""
+"""Options of the network for commands that run one detector, with one thread, per process."""
 
 DESCRIBED_POINTS = From(PointDetector, more="spread ranker descriptor")
 SELECTION = From(
@@ -46,10 +50,11 @@ def chosen_detector(
     options: From = POINTS,
     **defaults: Any,
 ) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
-    """Make the chosen detector and its selection options, and remove their options from the values.
+    """Make the chosen detector and its selection options, and take their options out of `values`.
 
-    `options` are the options of points. If the values do not say otherwise, there are at most
-    `max_keypoints` points, and the network has the options `defaults`.
+    `options` are those of the detector "points". Where `values` does not say otherwise, "points"
+    finds at most `max_keypoints` points, and the network has the options `defaults`. "points" has
+    no selection options, so None is returned for them.
     """
     network, points, selection = (source.take(values) for source in (NETWORK, options, SELECTION))
     if kind == "points":
@@ -57,7 +62,9 @@ def chosen_detector(
         points["resolution"] = network.pop("resolution", "auto")
     for name in (*network, *selection) if kind == "points" else points:
         other = "network" if kind == "points" else "points"
-        raise OptionError(f"`{name}` is for --detector {other}: leave it out, or choose that")
+        raise OptionError(
+            f"`{name}` is for --detector {other}: leave it out, or choose that detector"
+        )
     if kind == "points":
         return PointDetector(**points), None
     return DeepDetect(**{**defaults, **network}), SelectionOptions(**selection)

@@ -1,4 +1,4 @@
-"""Options of commands, generated from the library's signatures, and the output of results."""
+"""Command options that are generated from the library's signatures, and printing of results."""
 
 from __future__ import annotations
 
@@ -44,9 +44,10 @@ class From:
     Attributes:
         target: the function or class.
         common: names of the options that --help shows, separated by blanks.
-        more: names of those that only --help-all shows. None: all others.
-        flags: flags that differ from the name, such as {"focal_px": "--focal"}, or "--on/--off".
-        types: types of options whose parameter accepts more than can be typed.
+        more: names of the options that only --help-all shows. None: all other parameters.
+        flags: flags of options that are not named like their parameter, such as
+            {"focal_px": "--focal"}. "--on/--off" are the two flags of a boolean.
+        types: types of options whose parameters accept values that cannot be typed in a shell.
         defaults: texts that the help shows in place of the default value.
     """
 
@@ -81,7 +82,7 @@ class From:
             )
 
     def take(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Remove these options from the given values and return them."""
+        """Move the options that this object names out of `values`, and return them."""
         return {name: values.pop(name) for name in self.names() if name in values}
 
 
@@ -108,8 +109,8 @@ class Result:
             table.
         text: output for the terminal: the most important facts, at most a dozen lines.
         failures: a sentence about each input that failed. If there are any, the exit code is 1.
-        total, what: number and kind of the inputs. If there is one input and it fails, its failure
-            is raised as the error.
+        total, what: number of the inputs (0 if unknown), and what they are, in the plural. If there
+            is one input and it fails, its failure is raised as the error.
         exit_code: exit code if nothing failed.
     """
 
@@ -139,7 +140,7 @@ def command(
 ) -> Callable[[Callable[..., Result | None]], Callable[..., int]]:
     """Turn a function into a command, which prints its result and has the option --json.
 
-    The function receives the given options of the sources as its `**values`.
+    The options of the `sources` that a user gives reach the function as its `**values`.
     """
 
     def decorate(function: Callable[..., Result | None]) -> Callable[..., int]:
@@ -194,12 +195,15 @@ Format = Annotated[Literal["npz", "csv"], Parameter("--format", help="Format of 
 
 
 def output_file(output: Path, name: str) -> Path:
-    """Return the output file: -o itself if it has an ending, otherwise `name` in that folder."""
+    """Return the output file: -o itself if it has a suffix, otherwise `name` in the folder -o."""
     return output if output.suffix and not output.is_dir() else output / name
 
 
 def output_files(output: Path, stem: str, endings: Mapping[str, str]) -> dict[str, Path]:
-    """Return output files by kind: in the folder -o, or -o itself if there is only one file."""
+    """Return the output file of each kind: `stem` and the kind's ending, in the folder -o.
+
+    If there is only one kind, -o may also be the .npz or .csv file itself.
+    """
     if len(endings) == 1 and output.suffix in (".npz", ".csv"):
         return dict.fromkeys(endings, output)
     return {kind: output_folder(output) / f"{stem}{ending}" for kind, ending in endings.items()}
@@ -213,9 +217,10 @@ def output_folder(output: Path) -> Path:
 
 
 def expand_images(paths: Sequence[Path], output: Path) -> dict[str, Path]:
-    """Return the given images and those below given folders by name, as `name_images` does.
+    """Return the given images and those below the given folders, named as by `name_images`.
 
-    Files in the output folder are left out, and visualisations of other given images.
+    Images in the output folder are left out. So are, with a message, given images that a command
+    made from other given images.
     """
     given = {str(path.resolve()) for path in paths}
     kept = []
@@ -228,7 +233,7 @@ def expand_images(paths: Sequence[Path], output: Path) -> dict[str, Path]:
 
 
 def result_stems(images: Mapping[str, Path]) -> dict[Path, str]:
-    """Return the names of the images' results: without suffix, unless two would be the same."""
+    """Return the stem of each image's results: its name, without suffix if that stays unique."""
     stems = {name: name.removesuffix(path.suffix) for name, path in images.items()}
     count = Counter(stems.values())
     return {path: stems[n] if count[stems[n]] == 1 else n for n, path in images.items()}
@@ -236,7 +241,7 @@ def result_stems(images: Mapping[str, Path]) -> dict[Path, str]:
 
 def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     """Raise an OptionError if a file would be written twice, or would replace an input."""
-    # Names do not suffice: by links, or capitals on some systems, one file has several.
+    # Comparing names does not suffice, because of links and of systems that ignore case.
     files = {(path.stat().st_dev, path.stat().st_ino) for path in inputs if path.exists()}
     seen: set[Path] = set()
     for output in outputs:
@@ -251,7 +256,7 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
 
 @contextmanager
 def claimed(outputs: Outputs) -> Iterator[dict[str, Any]]:
-    """Write outputs as `Outputs.writing` does, and also undo them if a signal ends the process."""
+    """Write outputs as `Outputs.writing` does, and clean up even if a signal ends the process."""
     with handle_signals(exit_by_signal), outputs.writing() as values:
         yield values
 
@@ -269,7 +274,8 @@ def writing(
 ) -> Iterator[dict[Any, Path]]:
     """Yield temporary paths for files, as `whole` does, and record the inputs.
 
-    Inputs and the results of other inputs are never replaced.
+    Raise an OptionError if a file would replace an input or, without `overwrite`, the result of
+    other inputs.
     """
     check_outputs(files.values(), inputs)
     with claimed(Outputs([*files.values()], inputs, overwrite=overwrite)), whole(files) as made:
@@ -279,7 +285,7 @@ def writing(
 def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
     """Return a sentence and, below it, a table of the values whose names are given.
 
-    The times of stages are summed.
+    If "seconds" has a time for each stage, the table shows their sum.
     """
     shown = {name: values.get(name) for name in names.split()}
     if isinstance(seconds := shown.get("seconds"), Mapping):
@@ -288,9 +294,10 @@ def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
 
 
 def table(*columns: Mapping[str, Any], title: str = "", wrapped: bool = False) -> str:
-    """Return a text table of names and their value in each column, without nested lists.
+    """Return a text table: each row has a name and its value in each of the columns.
 
-    Long values are wrapped if `wrapped`; otherwise they stay on a line, for copying.
+    Lists of lists or of mappings are left out. Long values are wrapped if `wrapped`; otherwise each
+    stays on one line, so that it can be copied.
     """
     texts = [dict(_table_rows(values)) for values in columns]
     names = dict.fromkeys(name for column in texts for name in column)

@@ -32,7 +32,7 @@ def app(
     require_packages("deepdetect app", "starlette", "uvicorn")
     from ..app.server import AppServer
 
-    # Any signal to end acts as Ctrl+C, so that tasks are stopped and their files deleted.
+    # Any signal to end acts as Ctrl+C, so that tasks are stopped and their files are deleted.
     with endings_interrupt(), AppServer(AppOptions(**values)) as server:
         try:
             print(f"DeepDetect is at {server.address}", flush=True)

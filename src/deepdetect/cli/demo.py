@@ -25,8 +25,8 @@ from ._detection import NETWORK
 def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Result:
     """Match the Motorcycle stereo pair, and evaluate the matches by its ground-truth disparity.
 
-    The images (Middlebury 2014) come with the package scikit-image. The same number of random
-    points is matched for comparison, to show how many matches are correct by chance.
+    The images (Middlebury 2014) come with the package scikit-image. For comparison, the same number
+    of random pixels is also matched, which shows how many matches are correct by chance.
     """
     require_packages("the Motorcycle pair", "skimage")
     from skimage import data
@@ -43,7 +43,7 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
 
 
 def random_pixels(image: np.ndarray, count: int, generator: np.random.Generator) -> Keypoints:
-    """Draw random pixels of an image with equal probability, for comparison."""
+    """Choose `count` pixels of an image at random, as keypoints for comparison."""
     height, width = image.shape[:2]
     drawn = generator.choice(height * width, min(count, height * width), replace=False)
     xy = np.column_stack([drawn % width, drawn // width])

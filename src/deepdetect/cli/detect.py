@@ -43,20 +43,22 @@ def detect(
 ) -> cli.Result:
     """Detect keypoints in images (files or folders).
 
-    Writes for each image STEM.npz (or .csv) with the positions and scores, and the visualisations
-    STEM_keypoints.jpg (the best in all parts of the image, coloured by score) and, for the network,
-    STEM_dense.jpg (all keypoints) and STEM_heatmap.jpg (logits). Subfolders are kept.
+    Writes for each image STEM.npz (or .csv) with the positions and scores, and visualisations:
+    STEM_keypoints.jpg (the best keypoints of each part of the image, coloured by score) and, for
+    the network, STEM_dense.jpg (all keypoints) and STEM_heatmap.jpg (logits). Results of images in
+    subfolders go to subfolders of the same names.
 
-    Run again, the command skips finished images, and repeats them if its options differ. Results
-    of other images with the same name, and files of unknown origin, are replaced only with
-    --overwrite. If no image has any keypoint the exit code is 3.
+    Run again, the command skips finished images, unless its options have changed. Results of other
+    images with the same name, and files of unknown origin, are replaced only with --overwrite. If
+    no image has any keypoint, the exit code is 3.
 
         deepdetect detect photo.jpg
         deepdetect detect photos/ -o keypoints --detector points --spread grid
         deepdetect detect photo.jpg --density 0.1 --no-pictures -o points.csv
 
     Args:
-        ignore: Mask image of the same size: no keypoints where it is bright.
+        ignore: Mask image of the same size as the images. Where it is bright, no keypoints are
+            taken.
         pictures: Also write visualisations.
     """
     import_opencv()  # fails before anything is written if it is missing
@@ -68,7 +70,10 @@ def detect(
     cli.check_outputs([file for files in outputs.values() for file in files.values()], paths)
     mask = None if ignore is None else load_mask(ignore)
     if detector == "network" and "max_keypoints" in values:
-        cli.say("these are the best pixels of the heat map; --detector points finds better points")
+        cli.say(
+            "--max-keypoints keeps the best pixels of the heat map; --detector points finds better "
+            "keypoints"
+        )
     work = _Work(*chosen_detector(detector, values), mask, overwrite)
     work.say_what_is_replaced(outputs)
     results: list[dict[str, Any]] = []
@@ -114,7 +119,10 @@ class _Work:
         return dict(plain(self.detector.settings | options | noted | reading_options().settings))
 
     def say_what_is_replaced(self, outputs: dict[Path, dict[str, Path]]) -> None:
-        """Raise an OptionError for results of other images; print options that have changed."""
+        """Print which options have changed since the results of these images were written.
+
+        Raise an OptionError if results of other images would be replaced.
+        """
         changed, names = [], set()
         for path, files in outputs.items():
             Outputs([*files.values()], [path], overwrite=self.overwrite).find()
@@ -127,7 +135,7 @@ class _Work:
             names = {"detector"} if "detector" in names else names
             flags = ", ".join("--" + name.replace("_", "-") for name in sorted(names))
             whose = str(changed[0]) if len(changed) == 1 else f"{len(changed)} images"
-            cli.say(f"replacing the results of {whose} with other options ({flags})")
+            cli.say(f"replacing the results of {whose}, made with other options ({flags})")
 
     def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any]:
         shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
@@ -138,7 +146,8 @@ class _Work:
         earlier = None if self.overwrite else Outputs([files["file"]], [path]).find()
         started = time.perf_counter()
         rgb = load_image(path)
-        if "dense" in files and isinstance(self.detector, DeepDetect):  # the network runs once
+        if "dense" in files and isinstance(self.detector, DeepDetect):
+            # Both maps come from one call, so that the network runs only once.
             heatmap, logits = self.detector.heatmap_and_logits(rgb)
             selection = self.selection or SelectionOptions()
             keypoints = select_keypoints(heatmap, selection, logits, ignore=self.mask)
@@ -161,7 +170,7 @@ class _Work:
                 save_picture(draw_logits(logits), made["heatmap"])
             written = [file.name for file in outputs.paths]
             noted |= {"numbers": numbers, "settings": self.settings, "files": written}
-        for name in (earlier or {}).get("files", ()):  # files that these options do not write
+        for name in (earlier or {}).get("files", ()):  # files of the earlier run
             old = files["file"].with_name(name)
             with contextlib.suppress(OptionError):  # keeps a file that was changed since
                 if old not in outputs.paths and Outputs([old], [path]).find():

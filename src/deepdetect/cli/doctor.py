@@ -22,10 +22,10 @@ from ._options import Result, command, table
 PURPOSES = {
     "all": "the fast back end, ONNX files, the demo, HEIC, raw and compressed TIFF images",
     "app": "the page in a browser",
-    "sfm": "reconstruct of three images and more, extract, match-many, export, georeferences",
+    "sfm": "reconstruct with three or more images, extract, match-many, export, georeferences",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
-"""Maximum difference between the probabilities of two back ends: five times the usual value."""
+"""Two back ends may differ by this much in their probabilities, five times what is usual."""
 TIMED_ROUNDS = 5
 """The benchmark measures this many runs, after a first one that loads and compiles. Chosen by
 hand."""
@@ -52,8 +52,8 @@ def doctor(
 ) -> Result:
     """Check the installation: versions, OpenCV, back ends, and a self-test with a known answer.
 
-    Ends with exit code 1 if an installed package does not work. Nothing is sent anywhere. Please
-    add the output of --json to a report of a problem.
+    Ends with exit code 1 if an installed package does not work. Nothing is sent anywhere. If you
+    report a problem, please add the output of --json.
 
         deepdetect doctor
         deepdetect doctor --benchmark
@@ -66,7 +66,7 @@ def doctor(
     for check in CHECKS:
         try:
             findings += check()
-        except Exception as error:  # a broken installation raises anything
+        except Exception as error:  # a broken installation raises all kinds
             kind = "" if isinstance(error, DeepDetectError) else f"{type(error).__name__}: "
             reason = kind + first_line(error)
             findings.append(Finding(check.__name__, "problem", "does not work", reason))
@@ -81,7 +81,7 @@ def doctor(
 
 
 def packages() -> Iterator[Finding]:
-    """Report installed and outdated packages, and those that extras need."""
+    """Report the versions of installed packages, and what is missing or outdated."""
     yield Finding("deepdetect", "ok", f"{importlib.metadata.version('deepdetect')}, {__file__}")
     yield Finding("Python", "ok", f"{platform.python_version()} on {platform.platform()}")
     lacking: dict[str, list[str]] = {}
@@ -109,7 +109,7 @@ def packages() -> Iterator[Finding]:
 
 
 def opencv() -> Iterator[Finding]:
-    """Report which OpenCV is imported: its packages overwrite each other's files."""
+    """Report which OpenCV is imported, because OpenCV's packages overwrite each other's files."""
     module, names = import_opencv(), installed_distributions()
     contrib = hasattr(module, "xfeatures2d") or hasattr(module, "AgastFeatureDetector_create")
     value = f"{module.__version__} ({', '.join(names) or 'from no package'}), "
@@ -125,9 +125,10 @@ def opencv() -> Iterator[Finding]:
 
 
 def self_test() -> Iterator[Finding]:
-    """Detect with each back end, and match two pairs of known shifts: a plane, then two depths.
+    """Detect with each back end, and match two synthetic pairs whose shifts are known.
 
-    This also compiles the functions that other commands need.
+    The first pair shows a plane, the second a plane with a nearer square. The test also compiles
+    the functions that other commands need.
     """
     import numpy as np
 
@@ -148,7 +149,7 @@ def self_test() -> Iterator[Finding]:
     for name, heatmap in maps.items():
         difference = float(abs(heatmap - next(iter(maps.values()))).max())
         agrees = difference <= MAX_BACKEND_DIFFERENCE
-        value = f"probabilities within {difference:.0e} of the first"
+        value = f"probabilities within {difference:.0e} of the first back end's"
         remedy = "" if agrees else "choose another one with --backend"
         yield Finding(f"back end {name}", "ok" if agrees else "problem", value, remedy)
     points = PointDetector(256).detect(first)

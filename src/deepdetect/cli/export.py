@@ -56,14 +56,14 @@ ONNX = cli.From(
     OnnxOptions,
     "size",
     types={"size": str | None},
-    defaults={"size": "any; otherwise such as 480x640"},
+    defaults={"size": "any; give one such as 480x640 to fix it"},
 )
 Sources = Annotated[
     Path,
     Parameter(
         required=True,
-        help="File of `deepdetect extract` (with --matches), npz files of `detect` and `match` "
-        "(with --images), or a folder of images, which are then matched.",
+        help="Features file of `deepdetect extract` (with --matches), npz files of `detect` and "
+        "`match` (with --images), or a folder of images, which are then detected and matched.",
     ),
 ]
 
@@ -76,7 +76,7 @@ def colmap(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Write keypoints, descriptors and matches as a database of COLMAP 4.
+    """Write keypoints, descriptors and matches as a COLMAP 4 database.
 
     If -o is a folder, writes text files for colmap feature_importer and matches_importer instead.
 
@@ -146,7 +146,10 @@ def hloc(
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
-    """Return the file that marks a folder as our export; raise for other folders with files."""
+    """Return the path of the file that marks a folder as an earlier export.
+
+    Raise an OptionError if the folder has other files but not this one, unless `overwrite`.
+    """
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")
@@ -164,8 +167,8 @@ def _export(
 ) -> cli.Result:
     """Read a collection, or compute it from a folder, and write it.
 
-    The inputs of the output are recorded for the file `marker`. The values are the options of
-    `SAVED`, `FOLDER` and `MAX_KEYPOINTS`.
+    The file `marker` stands for the whole output: its record names the inputs. `values` are options
+    of `SAVED`, `FOLDER` and `MAX_KEYPOINTS`.
     """
     named = [Path(values[name]) for name in ("matches", "pairs") if name in values]
     inputs = [*sources, *(path for path in named if path.exists())]

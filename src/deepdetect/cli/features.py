@@ -37,9 +37,9 @@ def extract(
 ) -> cli.Result:
     """Extract the keypoints and descriptors of all images below a folder.
 
-    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. After an
-    interruption the same command continues. Run again, it adds new and changed images, and removes
-    the features of deleted images.
+    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. Run the same command
+    again to resume after an interruption, or to update the file: it adds new and changed images,
+    and removes the features of deleted images.
 
         deepdetect extract photos/ -o features.h5
         deepdetect extract photos/ -o features.h5 --engine ray --workers 64
@@ -50,7 +50,7 @@ def extract(
     """
     file = cli.output_file(output, "features.h5")
     how = EXTRACTION.take(values)
-    chosen, selection = chosen_detector(  # each process has one
+    chosen, selection = chosen_detector(  # each process gets a copy
         detector, values, options=DESCRIBED_POINTS, threads=1
     )
     report = extract_features(folder, file, chosen, selection=selection, quiet=False, **how)
@@ -60,7 +60,7 @@ def extract(
 
 @cli.command(PAIRS, MATCHING)
 def match_many(
-    features: Annotated[Path, Parameter(help="File of `deepdetect extract`, or of hloc.")],
+    features: Annotated[Path, Parameter(help="Features file of `deepdetect extract` or hloc.")],
     /,
     *,
     pairs: str,
@@ -69,17 +69,17 @@ def match_many(
 ) -> cli.Result:
     """Match the descriptors in a file of features, pair by pair.
 
-    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. After an
-    interruption the same command continues. Run again, it adds new pairs.
+    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. Run the same command
+    again to resume after an interruption, or to add the pairs that are new.
 
         deepdetect match-many features.h5 --pairs exhaustive
         deepdetect match-many features.h5 --pairs similar --verify fundamental
         deepdetect match-many features.h5 --pairs pairs.txt -o matches.h5
 
     Args:
-        pairs: exhaustive (all), sequential:10 (each image with the 10 that follow it by name),
-            similar:20 (each with the 20 most similar), or a text file with the names of two images
-            on each line, as hloc writes it.
+        pairs: Which pairs to match: exhaustive (all), sequential:10 (each image with the 10 that
+            follow it by name), similar:20 (each image with the 20 most similar), or a text file
+            with the names of two images on each line, as hloc writes it.
         output: File for the matches, or a folder for it.
     """
     file = cli.output_file(output, "matches.h5")

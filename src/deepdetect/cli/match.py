@@ -88,13 +88,14 @@ def match(
         deepdetect match frames/ --pairs sequential:1
 
     Args:
-        pairs: Pairs of more than two images: exhaustive (all), sequential:1 (each with the next by
-            name), or a text file with the names of two images on each line.
+        pairs: Which of more than two images to match: exhaustive (all pairs), sequential:1 (each
+            image with the next by name), or a text file with the names of two images on each line.
         unguided: Match by descriptors alone, over the whole image, and estimate a geometry from
             these matches.
-        homography: Text file with a known 3x3 homography, which determines the inliers.
-        camera0: Text file with the 3x3 matrix of the first camera, for the model essential.
-        camera1: Text file with that of the second camera.  [default: camera0]
+        homography: Text file with a known 3x3 homography from the first image to the second.
+            Matches that agree with it are the inliers.
+        camera0: Text file with the 3x3 matrix of the first camera, for --model essential.
+        camera1: Text file with the 3x3 matrix of the second camera.  [default: camera0]
         pictures: Also write a visualisation.
     """
     many = len(images) != 2 or any(path.is_dir() for path in images)
@@ -109,7 +110,7 @@ def match(
     if not unguided:
         flags = [*by_descriptors, *(["descriptor"] if "descriptor" in values else [])]
         for name in flags:
-            raise OptionError(f"`{name}` is for --unguided: add that, or leave it out")
+            raise OptionError(f"`{name}` is for --unguided: add that option, or leave `{name}` out")
     chosen, selection = chosen_detector(detector, values, options=DESCRIBED_POINTS)
     matrices = {"homography": homography, "camera0": camera0, "camera1": camera1 or camera0}
     known: dict[str, Any] = {
@@ -197,13 +198,15 @@ def _line(found: dict[str, Any]) -> str:
 def _choose_pairs(
     images: Sequence[Path], pairs: str | None, output: Path
 ) -> dict[tuple[Path, Path], str]:
-    """Return the chosen pairs, each with the name of its results."""
+    """Return the chosen pairs, each with the stem of its result files."""
     if pairs is None:
         return {(images[0], images[1]): f"{images[0].stem}_{images[1].stem}"}
     paths = cli.expand_images(images, output)
     wanted = list_pairs(pairs, [*paths])
     for name in {name for pair in wanted for name in pair} - paths.keys():
-        raise OptionError(f"{name} in {pairs} is not one of the images: use its relative path")
+        raise OptionError(
+            f"{name} in {pairs} is not one of the images: give its path relative to the folder"
+        )
     if not wanted:
         raise OptionError("one image makes no pair: give two or more images, or a folder")
     stems = {path: stem.replace("/", "-") for path, stem in cli.result_stems(paths).items()}
@@ -272,19 +275,20 @@ def register(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Register the second image to the first: for planes, and for images from one place.
+    """Register the second image to the first, if both show one plane or are from one place.
 
     Writes STEM1_on_STEM0.png (the second image warped into the frame of the first), both images
     combined as _checkerboard.png and _difference.png, and _homography.txt (3x3, from the first
     image to the second). The results keep the georeference, the colour profile and the EXIF of the
-    first image. If that is a GeoTIFF, or the second has other bands than RGB, the warped image is a
-    GeoTIFF with all its bands, unchanged.
+    first image. If the first image is a GeoTIFF, or the second is not a plain grey or RGB image,
+    the warped image is a TIFF with all bands of the second image, in their own data type.
 
         deepdetect register map.jpg photo-of-the-map.jpg -o registered
         deepdetect register ortho.tif drone.tif --bands 3 2 1 --extent union --apply-to thermal.tif
 
     Args:
-        apply_to: More files of the second camera, to be warped by the same homography.
+        apply_to: More images with the size and the view of the second image, such as a thermal
+            band. They are warped by the same homography.
     """
     reference, folder = read_metadata(image0, placed=True), cli.output_folder(output)
     own = {path: read_metadata(path) for path in (image1, *apply_to)}
@@ -335,9 +339,10 @@ def stitch(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Stitch overlapping images from one place, or of a plane, to a panorama.
+    """Stitch overlapping images, taken from one place or showing one plane, to a panorama.
 
-    They may be in any order. Images that do not overlap with others, or cannot be read, are listed.
+    The images may be in any order. Those that do not overlap with others, or cannot be read, are
+    left out and listed.
     A flat panorama covers at most 100 to 120 degrees, a cylindrical or spherical one up to 360.
 
         deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
@@ -345,16 +350,18 @@ def stitch(
 
     Args:
         output: File of the panorama, or a folder for it.
-        reference: Image that is not distorted, or in the middle of a curved panorama.
+        reference: Image that is undistorted in a flat panorama, and in the middle of a curved one.
             [default: the one in the middle]
     """
     file = cli.output_file(output, "panorama.jpg")
     paths = [*cli.expand_images(sources, file).values()]
-    picture_suffix(file)  # fails before the work, not after it
+    picture_suffix(file)  # checks the suffix before the long work
     if reference is not None and reference not in paths:
-        raise OptionError(f"--reference {reference} must be one of the images: name it there")
+        raise OptionError(f"--reference {reference} must be one of the images: add it to them")
     if detector == "network" and "max_keypoints" in values:
-        raise OptionError("--max-keypoints is for --detector points: leave it out, or choose that")
+        raise OptionError(
+            "--max-keypoints is for --detector points: leave it out, or choose that detector"
+        )
     chosen, _ = chosen_detector(detector, values)
     options = StitchingOptions(**OPTIONS.take(values))
     flat = values.get("projection", "plane") == "plane"
@@ -367,7 +374,7 @@ def stitch(
             carried.append(read_metadata(path, placed=flat))
             images.append(path)
     if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):
-        what = "too few images, or not the reference, can be read"
+        what = "too few images can be read, or the reference cannot"
         raise ImageError(f"there is no panorama, because {what}: {'; '.join(failures)}")
     cli.check_outputs([file], paths)
     with cli.writing({"file": file}, images, overwrite) as made:
@@ -381,7 +388,7 @@ def stitch(
                     progress=done,
                     **values,
                 )
-        except (OptionError, RegistrationError) as error:  # its message has indices of images
+        except (OptionError, RegistrationError) as error:  # its message has indices, not names
             text = str(error)
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))

@@ -50,11 +50,11 @@ MANY = cli.From(
     types={"control_points": Path | None},
 )
 WORKERS = cli.From(reconstruct_many, more="workers")
-"""Options of a reconstruction from more than two images that do not apply to two."""
+"""These options, like those of `MANY`, are only for more than two images."""
 
 CHOSEN = replace(
     SELECTION,
-    defaults={"max_keypoints": f"{MAX_KEYPOINTS} points; for two images 2048, for the network all"},
+    defaults={"max_keypoints": f"{MAX_KEYPOINTS} (two images: 2048); with --detector network all"},
 )
 DETECTOR = replace(
     NETWORK,
@@ -80,15 +80,15 @@ def reconstruct(
 
     Two images, left and right: writes model.ply and model.glb (the points), model.html (an offline
     viewer), model_depth.jpg (a coloured depth map), model_depth.png (16 bits, with its scale),
-    model_depth.npz (floats, and disparities for rectified pairs), and model.json (counts, times
-    and quality). For rectified pairs the detector only chooses which pixels of a dense disparity
-    map become points; --density 1 takes all of them.
+    model_depth.npz (depths as floats, and the disparities of a rectified pair), and model.json
+    (counts, times and quality). For rectified pairs the detector only chooses which pixels of a
+    dense disparity map become points; --density 1 takes all of them.
 
-    A folder, or three and more images: also estimates the cameras. Writes model.ply, model.glb,
+    A folder, or three or more images: also estimates the cameras. Writes model.ply, model.glb,
     model.html (with the cameras), model.json, transforms.json, and COLMAP's sparse/0 and
-    database.db. If the images have GPS, the model is in metres east, north and up. After an
-    interruption the same command continues. Images that cannot be read, or show something else,
-    are left out and listed.
+    database.db. If the images have GPS positions, the model is in metres east, north and up. Run
+    the same command again to resume after an interruption. Images that cannot be read, or show
+    something else, are left out and listed.
 
         deepdetect reconstruct left.png right.png --calibration calib.json -o model.ply
         deepdetect reconstruct left.jpg right.jpg --focal 1250
@@ -99,14 +99,14 @@ def reconstruct(
         deepdetect reconstruct photos/ --scale-by 0.25 a.jpg:812,640 a.jpg:1290,655 -o model/
 
     Args:
-        output: Folder for all files. For two images it may also be the model (.ply, .glb or .html),
-            whose name the other files then have.
-        detector: network: pixels of its heat map; points: ranked points of all scales.  [default:
-            network; for more than two images points]
+        output: Folder for all files. For two images it may also be the name of the model (.ply,
+            .glb or .html); the other files are then named after it.
+        detector: 'network' selects pixels of the network's heat map; 'points' ranks points of all
+            scales and takes the best.  [default: network; for more than two images points]
     """
     folders = [path for path in images if path.is_dir()]
     if folders and len(images) > 1:
-        raise OptionError("give one folder, or images: not both")
+        raise OptionError("give either one folder or only image files")
     if len(images) == 1 and not folders:
         raise OptionError("give two or more images, or a folder")
     if len(images) > 2 or folders:

@@ -27,7 +27,7 @@ FRAMES = cli.From(
 
 @cli.command(FRAMES, TRACKING, cli.READING)
 def track(
-    source: Annotated[str, Parameter(help="A video file, a folder, or the number of a camera.")],
+    source: Annotated[str, Parameter(help="Video file, folder of frames, or number of a camera.")],
     /,
     *,
     output: cli.Output = Path("tracks.mp4"),
@@ -37,16 +37,18 @@ def track(
     """Track keypoints through a video file, a folder of frames, or the images of a camera.
 
     Writes a video that shows the points, their last positions and the frames processed per second,
-    and a table of all tracks (.csv): frame, track, x, y, score. Ctrl+C, SIGTERM or SIGHUP ends the
-    recording of a camera, and both files are written. Images that cannot be read, or differ in size
-    from the first one, are listed at the end, with exit code 1.
+    and a table of all tracks (.csv) with the columns frame, track, x, y and score. A recording of a
+    camera runs until Ctrl+C, SIGTERM or SIGHUP ends it; both files are then finished. Images of a
+    folder that cannot be read, or differ in size from the first one, are listed at the end, and the
+    exit code is 1.
 
         deepdetect track drive.mp4 -o tracks.mp4
         deepdetect track frames/ -o tracks.mp4 --max-keypoints 500
         deepdetect track 0 -o webcam.mp4 --max-side 640
 
     Args:
-        output: Video (.mp4, .mov, .mkv, .avi), table (.csv) alone, or a folder for both.
+        output: Video file (.mp4, .mov, .mkv or .avi), with the table next to it; a .csv file for
+            the table only; or a folder for both.
     """
     file = cli.output_file(output, "tracks.mp4")
     files = [path for path in output_files(file) if path is not None]

@@ -23,12 +23,14 @@ SHOWN = (".html", ".jpg", ".jpeg", ".png", ".webp", ".gif", ".svg", ".pdf")
 def view(
     file: Annotated[Path, Parameter(help="A file that another command wrote.")],
     /,
-    *images: Annotated[Path, Parameter(help="Images of keypoints (one) or of matches (two).")],
+    *images: Annotated[
+        Path, Parameter(help="The image of the keypoints, or both images of the matches.")
+    ],
 ) -> cli.Result:
     """Show a result in the browser.
 
-    Pages and images are shown as they are. For a point cloud or a depth map, the page or image of
-    the same name in its folder is shown. Keypoints and matches are drawn on their images.
+    Pages and images are shown as they are. For a point cloud or a depth map, the page or image with
+    the same name next to it is shown. Keypoints and matches are drawn on their images.
 
         deepdetect view model.ply
         deepdetect view left.npz left.png

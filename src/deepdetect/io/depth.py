@@ -13,8 +13,8 @@ from .._shared.records import save_arrays
 MAX_UINT16 = 65535
 
 HEADROOM = 4.0
-"""The scale covers depths up to this many times the 99th percentile. If it also covered outliers,
-its steps would be coarse."""
+"""The scale of a PNG covers depths up to this many times their 99th percentile. If it also covered
+outliers beyond that, its steps would be coarse."""
 
 
 def save_depth_png(
@@ -61,7 +61,7 @@ def _scale(depths: np.ndarray) -> float:
 
 
 def depth_scale(furthest: float) -> float:
-    """Choose the finest scale, 1, 2 or 5 times a power of ten, that covers a depth."""
+    """Return the finest scale, 1, 2 or 5 times a power of ten, that fits a depth into 16 bits."""
     finest = MAX_UINT16 / furthest
     power = 10.0 ** np.floor(np.log10(finest))
     return float(max(step * power for step in (1, 2, 5) if step * power <= finest * (1 + 1e-12)))

@@ -12,22 +12,23 @@ from ..geometry.camera import Calibration, Camera, Size
 from .image_file import file_name, is_file, open_image
 
 DIAGONAL_35MM_MM = float(np.hypot(36, 24))
-"""Diagonal of a 35 mm film frame in mm. The 35 mm equivalent focal length refers to it (CIPA)."""
+"""Diagonal of a 35 mm film frame in mm. The 35 mm equivalent focal length is defined by it
+(CIPA)."""
 
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""Length in mm by FocalPlaneResolutionUnit: inch and cm as in the standard, and mm and micrometre,
-which cameras also use."""
+"""Length in mm of the unit for each code of FocalPlaneResolutionUnit: inch and cm as in the
+standard, and mm and micrometre, which cameras also use."""
 
 TRANSPOSED = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
 
 MAX_FOCAL_DIFFERENCE = 0.1
 """The focal length computed from the sensor resolution is more precise than the 35 mm equivalent
-but often wrong. It is used if their relative difference is below this. Chosen by hand."""
+but often wrong. It is used if the two differ by at most this fraction. Chosen by hand."""
 
 MAX_ASPECT_DIFFERENCE = 0.01
-"""A photograph counts as cropped if its aspect ratio differs from EXIF's by more than this. Chosen
-by hand."""
+"""A photograph counts as cropped if its aspect ratio differs from the one in its EXIF by more than
+this fraction. Chosen by hand."""
 
 ADVICE = "give `focal_px` or `calibration`"
 
@@ -39,10 +40,11 @@ def calibration_from_exif(image0: Any, image1: Any, size0: Size, size1: Size) ->
 
 
 def camera_from_exif(image: Any, size: Size) -> Camera:
-    """Read the camera of a photograph, a file or PIL image that loads as (width, height) pixels.
+    """Read the camera of a photograph, which is a file or a PIL image, from its EXIF.
 
-    The focal length is computed from FocalLength and the sensor resolution if that agrees with
-    FocalLengthIn35mmFilm or the latter is missing; otherwise from FocalLengthIn35mmFilm.
+    `size` is (width, height) as `load_image` returns the photograph. The focal length is computed
+    from the tags FocalLength and sensor resolution if the result agrees with FocalLengthIn35mmFilm,
+    or that tag is missing; otherwise from FocalLengthIn35mmFilm.
 
     Raises:
         ReconstructionError: there is no usable focal length, or the photograph was cropped later.
@@ -80,9 +82,9 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 
 def _tags(image: Any) -> tuple[dict[int, Any], int]:
-    """Read the EXIF tags and the orientation that `load_image` undoes, 1 for PIL images.
+    """Read the EXIF tags, and the orientation from which `load_image` turns a file upright.
 
-    Unreadable tags count as missing.
+    The orientation is 1 for PIL images, which are not turned. Unreadable tags count as missing.
     """
     try:
         if hasattr(image, "getexif"):
@@ -94,7 +96,7 @@ def _tags(image: Any) -> tuple[dict[int, Any], int]:
             # The HEIF plug-in turns images upright and resets the usual tag.
             orientation = opened.info.get("original_orientation") or exif.get(Base.Orientation, 1)
             return dict(exif.get_ifd(IFD.Exif)), int(orientation)
-    except Exception:  # Pillow raises many types; broken tags are ignored
+    except Exception:  # Pillow raises many types of errors; broken tags are ignored
         return {}, 1
 
 

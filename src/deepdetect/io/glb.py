@@ -32,8 +32,8 @@ def write_glb(
     Colours are converted to linear values, as glTF requires. They have 16 bits, so that all 256
     sRGB levels stay distinct. The asset's extras contain the metadata, the unit and the frame.
     """
-    # Rotation about the x axis makes y point up: by 180 degrees from a camera's frame, by 90 from
-    # one with z up. Units of unknown length are written as metres, and the extras say so.
+    # A rotation about the x axis makes y point up: by 180 degrees for a camera's frame, and by 90
+    # for a frame with z up. Units of unknown length are written as metres, and the extras say so.
     turned = cloud.points[:, [0, 2, 1]] if cloud.frame == EAST_NORTH_UP else cloud.points
     signs = [1, 1, -1] if cloud.frame == EAST_NORTH_UP else [1, -1, -1]
     unit = 1e-3 if cloud.unit == "mm" else 1.0
@@ -81,7 +81,7 @@ def _tree(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "point cloud"}],
         "meshes": [{"primitives": [primitive]}],
-        # Points have no normals to be lit by; this extension tells viewers not to try.
+        # Without normals points cannot be lit. This extension tells viewers to show plain colours.
         "extensionsUsed": ["KHR_materials_unlit"],
         "materials": [
             {"pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}

@@ -13,7 +13,7 @@ from PIL.ExifTags import GPS, IFD, Base
 from .image_file import open_image
 
 XMP_OF_DRONES = re.compile(rb"(?<!/)drone-dji:(\w+)\s*(?:=\s*[\"']([^\"']*)|>([^<]*))")
-"""XMP properties of DJI drones, which write them as attributes or as elements."""
+"""This pattern finds XMP properties of DJI drones, which write them as attributes or elements."""
 
 MAX_GRAVITY_TILT_DEG = 120.0
 """Larger gimbal angles, in degrees, are treated as invalid. Chosen by hand."""
@@ -48,7 +48,7 @@ def read_gps(path: Path) -> GpsFix | None:
             exif, xmp = image.getexif(), image.info.get("xmp") or b""
             tags = dict(exif.get_ifd(IFD.GPSInfo))
         orientation = exif.get(Base.Orientation, 1)
-    except Exception:  # Pillow raises many types; broken tags are ignored
+    except Exception:  # Pillow raises many types of errors; broken tags are ignored
         return None
     found = XMP_OF_DRONES.findall(xmp if isinstance(xmp, bytes) else xmp.encode())
     drone = {name.decode(): _number(one or other) for name, one, other in found}
@@ -81,7 +81,10 @@ def read_gps(path: Path) -> GpsFix | None:
 
 
 def _gravity(drone: dict[str, float]) -> np.ndarray | None:
-    """Return the direction to the ground from the gimbal's roll and pitch (0: level, -90: down)."""
+    """Return the unit vector towards the ground in the camera's frame; None if unknown.
+
+    It is computed from roll and pitch of the gimbal in degrees. A pitch of 0 is level, -90 is down.
+    """
     angles = drone.get("GimbalPitchDegree", np.nan), drone.get("GimbalRollDegree", np.nan)
     if not max(map(abs, angles)) <= MAX_GRAVITY_TILT_DEG:
         return None
@@ -90,7 +93,10 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 
 def _degrees(value: Any, sign: Any, below: str) -> float:
-    """Convert degrees, minutes and seconds to degrees; NaN for anything else."""
+    """Convert degrees, minutes and seconds to degrees, negative if `sign` is `below` (S or W).
+
+    Any other value becomes NaN.
+    """
     try:
         degrees, minutes, seconds = (_number(part) for part in value)
     except (TypeError, ValueError):

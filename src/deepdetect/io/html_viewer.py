@@ -21,17 +21,19 @@ from ..geometry.camera import PosedView, camera_spacing
 from ..geometry.point_cloud import UNITS, PointCloud, RobustBox, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
-"""Tangent of half the field of view: default and allowed range. Chosen by hand."""
+"""The page's field of view as the tangent of its half angle: the default, and the allowed range.
+Chosen by hand."""
 
 MAX_LEVEL = 65535
-"""Positions are stored in 16 bits per axis."""
+"""Positions are stored as whole numbers from 0 to this one along each axis, in 16 bits."""
 
 MARGIN = 1.0
 """Points farther outside the robust box than this times its size are left out, because a few very
 distant points would make the quantisation steps coarse for all. Chosen by hand."""
 
 CAMERA_SIZE = 0.35
-"""Depth of a camera's pyramid relative to the distance to the nearest camera. Chosen by hand."""
+"""A camera is drawn as a pyramid. Its depth is this fraction of the median distance from a camera
+to the nearest other one. Chosen by hand."""
 
 OVERVIEW_RADIANS = (0.4, 0.5)
 """Azimuth and elevation of the first view of a page with cameras. Chosen by hand."""
@@ -42,8 +44,9 @@ OVERVIEW_POINTS = 2000
 
 @dataclass(frozen=True, eq=False)
 class PagePoints:
-    """Points as the page stores them: position = offset + levels * step, all (N, 3).
+    """Points as the page stores them: (N, 3) uint16 levels and (N, 3) uint8 colours.
 
+    The position of a point is offset + levels * step, with an offset and a step (3,) for each axis.
     `left_out` is the number of points that are not stored because they are too far away.
     """
 
@@ -79,12 +82,12 @@ def write_html_page(
         "caption": "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in caption.items()
         ),
-        "cloud": json.dumps(_description(cloud, stored, cameras)),  # has no text of users to escape
+        "cloud": json.dumps(_description(cloud, stored, cameras)),  # no text of users
         "positions": _base64(stored.levels.astype("<u2")),
         "colors": _base64(stored.colors),
     }
     template = resources.files(__package__).joinpath("viewer.html").read_text("utf-8")
-    # In one pass, so that metadata that contains a placeholder is not replaced.
+    # One pass fills in all values, so that placeholders within the metadata stay as they are.
     page = re.sub(r"\{\{(\w+)\}\}", lambda mark: values[mark[1]], template)
     path.write_text(page, encoding="utf-8")
 
@@ -92,7 +95,7 @@ def write_html_page(
 def page_points(cloud: PointCloud) -> PagePoints:
     """Quantise positions to 16 bits per axis, without those far outside the robust box."""
     box = robust_box(cloud)
-    # The box of points on a line or a plane is flat, so its radius gives a least margin.
+    # Points on a line or a plane have a flat box, so its radius sets the smallest margin.
     margin = MARGIN * np.maximum(box.high - box.low, box.radius * 1e-3)
     near = ((cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)).all(1)
     points = cloud.points[near].astype(np.float64)
@@ -166,7 +169,10 @@ def _overview(
 
 
 def _largest_slope(cloud: PointCloud) -> float:
-    """Return the tangent of the half field of view in which the origin sees nearly all points."""
+    """Return the tangent of half the field of view in which a camera at the origin sees the cloud.
+
+    It shows 99% of the points in front of the camera, unless `SLOPES` limits it.
+    """
     before = cloud.points[cloud.points[:, 2] > 0].astype(np.float64)
     if not len(before):
         return DEFAULT_SLOPE

@@ -1,4 +1,4 @@
-"""Reading images of any usual kind, one or several, as 8-bit RGB or as luma.
+"""Reading images from files, bytes, PIL images and arrays, as 8-bit RGB or as luma.
 
 Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 """
@@ -39,8 +39,8 @@ MINIMUM_SIDE = 16
 
 ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26
-"""Length in bytes of a PNG file's header up to bit depth and colour type. The colour type
-`GREY_PNG` is grey without alpha."""
+"""A PNG file states its bit depth and its colour type within this many first bytes. `GREY_PNG` is
+the colour type of grey without alpha."""
 GREY_PNG = 0
 
 STRIP_PIXELS = 1 << 20
@@ -56,7 +56,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: cv2.flip(cv2.transpose(image), -1),
     8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
 }
-"""Functions that turn images upright, by their EXIF orientation."""
+"""Each EXIF orientation from 2 on has a function here that turns an image upright."""
 
 
 @suggest_keywords
@@ -84,14 +84,16 @@ def load_image(
             a file of few bytes can hold billions of pixels. None: 200, or `--max-megapixels` in a
             command. One megapixel takes 3 MB, and up to 7 MB while it is read. Pillow itself reads
             WebP files of at most 178 megapixels (`PIL.Image.MAX_IMAGE_PIXELS`).
-        value_range: values of black and white, such as (0, 4095) for a 12-bit sensor. None: those
-            that the file states. Otherwise: 0 and 1 for floats; for uint16 0 and the smallest of
-            255, 1023, 4095, 16383 and 65535 that no pixel exceeds. Other integers need it.
+        value_range: the values of black and of white, such as (0, 4095) for a 12-bit sensor. None:
+            the values that the file states. If it states none, they are 0 and 1 for floats, and for
+            uint16 0 and the smallest of 255, 1023, 4095, 16383 and 65535 that no pixel exceeds.
+            Integers that are neither uint8 nor uint16 need this option.
         bands: numbers, from 1, of the three bands of a TIFF file or array that become red, green
-            and blue: (4, 3, 2) for Landsat 8. None: the first three. Four bands without alpha, or
-            more than four, need it.
-        page: number of the image in a file with several, from 0, thumbnails not counted. None: the
-            largest image of a TIFF file (the first of equals), otherwise the first image.
+            and blue: (4, 3, 2) for Landsat 8. None: the first three. Images of four bands without
+            alpha, or of more than four bands, need this option.
+        page: number, from 0, of the image to read from a file with several; thumbnails do not
+            count. None: the largest image of a TIFF file (the first of equally large ones), and
+            the first image of any other file.
         allow_truncated: read truncated files; the missing part is black or grey.
 
     Returns:
@@ -134,7 +136,7 @@ def _load(
     *,
     deep: bool = False,
     raw: bool = False,
-    **for_arrays: Any,  # options of a command apply to files only
+    **for_arrays: Any,  # options of the call; those of a command apply to files only
 ) -> np.ndarray:
     if is_file(image):
         rgb = _read_file(image, options, deep, raw)
@@ -156,7 +158,7 @@ def _load(
 
 
 def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
-    """Load the images of a list, tuple or batch one by one, each with its index."""
+    """Load the images of a list, tuple or batch one by one; yield the index and pixels of each."""
     batch_length(images)
     for number, image in enumerate(images):
         with image_named(number):
@@ -176,7 +178,7 @@ def batch_length(images: Images) -> int:
 
 @contextmanager
 def image_named(number: int) -> Iterator[None]:
-    """Add the image's index in its list to the messages of errors in the block."""
+    """Add the image's index in its list to the messages of errors that the block raises."""
     try:
         yield
     except (ImageError, OptionError) as error:
@@ -249,8 +251,8 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
 def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str, Path]:
     """Return a dictionary of the given image files and those below the given folders, by name.
 
-    A name is the path relative to the given folder, or, if two would be the same, to the common
-    parent folder.
+    The name of an image is its path relative to the given folder; for a given file it is the file
+    name. If two names would be the same, all are relative to the common parent folder.
     """
     names: dict[Path, Path] = {}
     for path in paths:
@@ -295,7 +297,7 @@ def orientation_of(image: Any) -> Any:
     """Return the EXIF orientation of a loaded image; a broken tag is ignored."""
     try:
         return image.getexif().get(ORIENTATION_TAG, 1)
-    except Exception:  # Pillow's readers raise many kinds
+    except Exception:  # Pillow's readers raise many kinds of errors
         return 1
 
 
@@ -307,11 +309,11 @@ def _from_pil(
 ) -> np.ndarray:
     try:
         image.load()
-    except Exception as error:  # Pillow's decoders raise many kinds
+    except Exception as error:  # Pillow's decoders raise many kinds of errors
         raise damaged_image(name, error) from None
     if image.mode.startswith(("I", "F")):
         values = deep_values(image)
-        white = 65535 if image.format == "PPM" else None  # Pillow scales PPM to this white
+        white = 65535 if image.format == "PPM" else None  # Pillow scales white to this in PPM
         return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
@@ -327,5 +329,5 @@ def _strip_to_rgb(image: Any) -> np.ndarray:
     if image.mode == "P" and isinstance(image.info.get("transparency"), bytes):
         image = image.convert("RGBA")  # avoids a warning of Pillow about the alpha of palettes
     if image.mode == "La":
-        image = image.convert("LA")  # Pillow converts this mode to no other
+        image = image.convert("LA")  # Pillow converts "La" to no other mode
     return np.asarray(image.convert("RGB"))

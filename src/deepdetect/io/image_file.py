@@ -63,22 +63,22 @@ UNREAD = {
     b"\x93NUMPY": ("a NumPy array", ""),
     b"DICM": ("a DICOM image", ".dcm"),
 }
-"""First bytes, name and suffix of formats that are not read, since their value range is undefined.
-The error names the format."""
+"""These formats are not read, since their value range is undefined; the error names them. For each
+format there are its first bytes, name and suffixes."""
 
 _OTHERS = (suffixes for _, suffixes in UNREAD.values())
 IMAGE_SUFFIXES = (*" ".join([*FORMATS.values(), *_OTHERS]).split(), *RAW_SUFFIXES)
 """Suffixes of image files that are read or rejected with a reason."""
 
 MAX_MEGAPIXELS = 200.0
-"""Larger images are rejected by default: the largest sensors of phones have 200 megapixels."""
+"""Images with more megapixels are rejected by default. The largest phone sensors have 200."""
 
 SIGNATURE_BYTES = 132
 """Formats are recognised by this many first bytes, because DICOM's signature is in bytes 128 to
 131."""
 
 STANDARD_INPUT = "/dev/stdin"
-"""Name of standard input on every system; commands accept "-" for it."""
+"""This path means standard input on every system. Commands also accept "-"."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -141,7 +141,8 @@ _reading: ContextVar[ReadingOptions] = ContextVar("reading", default=_USUAL)
 def read_with(options: ReadingOptions) -> Iterator[None]:
     """Read image files with these options in the block, unless a call has options of its own.
 
-    Commands use it, because images are read deep below them. It does not reach other processes.
+    Commands use this, because the functions between a command and the reading of an image do not
+    pass reading options on. Other processes are not affected.
     """
     token = _reading.set(options)
     try:
@@ -151,7 +152,7 @@ def read_with(options: ReadingOptions) -> Iterator[None]:
 
 
 def reading_options(**given: Any) -> ReadingOptions:
-    """Return the options of `read_with`, replaced by the given options that are not None."""
+    """Return the options that `read_with` set, with those replaced that are given and not None."""
     return replace(_reading.get(), **{n: value for n, value in given.items() if value is not None})
 
 
@@ -162,8 +163,8 @@ def open_image(
     """Open an image file as a PIL image; its pixels are decoded when it is loaded.
 
     The source is a path, the content of a file as bytes, or a binary file, which is read from its
-    beginning and stays open. Pillow's errors in the block become those below. `what` is the name
-    of an image without a path.
+    beginning and stays open. Pillow's errors in the block become those below. In their messages
+    `what` stands for the name of an image without a path.
 
     Raises:
         ImageError: the file is missing, truncated, damaged (where the format allows to detect it),
@@ -215,12 +216,12 @@ def open_file(source: Any, what: str = "image") -> Iterator[tuple[BinaryIO, str]
         if error.errno is None:  # from Pillow, not from the file system
             raise damaged_image(name, error) from None
         raise ImageError(f"{name} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # Pillow's decoders raise many types
+    except Exception as error:  # Pillow's decoders raise many types of errors
         raise damaged_image(name, error) from None
 
 
 def file_name(source: Any, what: str = "image") -> str:
-    """Return the name of a file for errors: its path if it has one, otherwise "the image"."""
+    """Return the name of a file for errors: its path if it has one, otherwise "the" and `what`."""
     if is_path(source):
         return os.fsdecode(source)
     name = getattr(source, "name", None)
@@ -286,14 +287,14 @@ def _standard_input() -> bytes:
 
 
 def _check_png(file: BinaryIO, name: str) -> None:
-    """Verify the checksums of a PNG file, if it is one: Pillow skips those of the pixels."""
+    """If the file is a PNG file, verify its checksums, because Pillow skips those of the pixels."""
     if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
         kind = b""
         while kind != b"IEND":
             header = file.read(8)
             left, kind = int.from_bytes(header[:4], "big"), header[4:]
             checksum = zlib.crc32(kind)
-            # In pieces, as a damaged length may be 4 GB.
+            # Read in pieces, because a damaged file may state a length of 4 GB.
             while left and (piece := file.read(min(left, 1 << 20))):
                 checksum = zlib.crc32(piece, checksum)
                 left -= len(piece)

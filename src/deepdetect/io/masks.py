@@ -14,7 +14,8 @@ from .image import UPRIGHT, orientation_of
 from .image_file import open_image
 
 WHITES = (1, 255, 65535)
-"""Values that can be white. A mask of 1, 8 or 16 bits may be stored in a file with more bits."""
+"""White is one of these values, but the file does not tell which: a mask of 1, 8 or 16 bits may be
+stored in a file with more bits."""
 
 
 def save_mask(mask: np.ndarray, path: str | Path) -> None:
@@ -33,8 +34,9 @@ def encode_mask(mask: np.ndarray) -> bytes:
 def load_mask(source: Any) -> np.ndarray:
     """Read a mask of any bit depth as (H, W) bool: True where a pixel is brighter than mid-grey.
 
-    White is the smallest of `WHITES` that no pixel exceeds, otherwise the brightest pixel. The mask
-    is turned upright, as in `load_image`. Arguments and errors are those of `open_image`.
+    White is the smallest of `WHITES` that no pixel exceeds, or the largest pixel value if there is
+    none. The mask is turned upright, as in `load_image`. Arguments and errors are those of
+    `open_image`.
     """
     with open_image(source, what="mask") as opened:
         deep = opened.mode.startswith("I")  # 16 or 32 bits per pixel

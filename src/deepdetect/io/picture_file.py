@@ -25,13 +25,14 @@ from .image_file import open_file, open_image, reading_options
 from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
-"""Tags of GeoTIFF for pixel scale and transformation. A georeferenced file has one of them."""
+"""Tags of GeoTIFF for pixel scale and transformation. A georeferenced TIFF has one of them."""
 
 PLACED_FORMATS = ("TIFF", "JPEG", "PNG", "JPEG2000", "BMP", "GIF")
 """Pillow's names of formats whose georeference GDAL can read."""
 
 FIRST_CENTRE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-"""Matrix from our pixels to GDAL's, where (0, 0) is the top left corner of the first pixel."""
+"""Matrix from pixel coordinates of this package, where (0, 0) is the centre of the first pixel, to
+those of GDAL, where (0, 0) is the top left corner of that pixel."""
 
 ICC_PROFILE = 34675
 
@@ -60,11 +61,13 @@ class Metadata:
     """What an image file contains in addition to its pixels.
 
     Attributes:
-        to_world: (3, 3) matrix from pixels (first centre at (0, 0)) to world coordinates, or None.
-        crs: coordinate reference system as an object of rasterio; None: a local grid.
+        to_world: (3, 3) matrix from pixels, where (0, 0) is the centre of the first one, to world
+            coordinates; None without a georeference.
+        crs: coordinate reference system of the world as an object of rasterio; None: a local grid.
         no_data: value that means "no data" according to GDAL's tag, or None.
-        profile, exif: the ICC profile, and EXIF as Pillow's object; or None.
-        plain: whether pixels are grey or RGB of 8 or 16 bits.
+        profile: the ICC profile, or None.
+        exif: the EXIF as an object of Pillow, or None.
+        plain: whether pixels are grey, RGB or RGB with alpha, of at most 16 bits per value.
     """
 
     to_world: np.ndarray | None = None
@@ -86,7 +89,7 @@ class Metadata:
             return
         numbers = self.to_world[:2].T.ravel()
         texts = {_world_files(path)[0]: "".join(f"{number:.17g}\n" for number in numbers)}
-        with suppress(AttributeError, ValueError):  # no CRS, or one that this dialect cannot state
+        with suppress(AttributeError, ValueError):  # no CRS, or one that WKT1 cannot state
             texts[path.with_suffix(".prj")] = self.crs.to_wkt(version="WKT1_ESRI")
         for place, text in texts.items():
             with atomic_path(place) as temporary:
@@ -100,7 +103,8 @@ class Metadata:
                 parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
         kept = {kind: np.frombuffer(part, np.uint8) for kind, part in parts.items() if part}
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-        for count in range(len(kept), 0, -1):  # without EXIF if that is too large, then without ICC
+        # A part that is too large makes the encoder fail. EXIF is left out first, then also ICC.
+        for count in range(len(kept), 0, -1):
             kinds, values = [*kept][:count], [*kept.values()][:count]
             done, data = cv2.imencodeWithMetadata(suffix, bgr, kinds, values, settings)
             if done:
@@ -108,19 +112,19 @@ class Metadata:
         return bytes(cv2.imencode(suffix, bgr, settings)[1])
 
     def _profile_of(self, space: bytes) -> bytes | None:
-        """Return the ICC profile if it is complete and for the colour space that is written."""
+        """Return the ICC profile if it is complete and for the colour space `space`, or None."""
         profile = self.profile or b""
         length = int.from_bytes(profile[:4], "big")
         return profile[:length] if length <= len(profile) and profile[16:20] == space else None
 
     def _exif_of(self, picture: np.ndarray) -> Any:
-        """Return the EXIF for an upright image of another size, or None."""
+        """Return the EXIF, adapted to the size of an upright picture, or None if there is none."""
         if not self.exif:
             return None
         height, width = picture.shape[:2]
         fine = self.exif.get_ifd(IFD.Exif)
         size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
-        if size != (width, height):  # the 35 mm equivalent applies to the whole frame only
+        if size != (width, height):  # this tag applies to the whole frame only
             fine.pop(Base.FocalLengthIn35mmFilm, None)
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1
@@ -167,7 +171,7 @@ class Metadata:
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
-    """Return whether there are EXIF values, and Pillow can write them: some it can only read."""
+    """Return whether there are EXIF values, and Pillow can write them; some it can only read."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     directory = ImageFileDirectory_v2()
@@ -201,7 +205,7 @@ def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
     The georeference is read if `placed` and the source is a path.
 
     Raises:
-        MissingExtraError: it has a georeference, and rasterio is not installed.
+        MissingExtraError: the file has a georeference, and rasterio is not installed.
     """
     found, kind, page, orientation = Metadata(), "", None, 1
     path = Path(source) if isinstance(source, (str, Path)) else None
@@ -210,7 +214,7 @@ def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
     with open_file(source) as (file, _):
         if file.read(4) in TIFF_STARTS:
             (found, page), kind = _of_tiff(file), "TIFF"
-    with suppress(Exception), open_image(source) as image:  # fails for raw photographs and others
+    with suppress(Exception), open_image(source) as image:  # fails for raw photographs
         found = replace(found, profile=found.profile or image.info.get("icc_profile"))
         exif, kind = image.getexif(), image.format
         kept = _kept_exif(exif) if kind == "TIFF" else exif
@@ -229,7 +233,7 @@ def _read_place(path: Path, page: Any) -> dict[str, Any]:
     if not (tagged or any(each.is_file() for each in _world_files(path))):
         return place
     require_packages(f"the georeference of {path}", "rasterio")
-    name = str(path.absolute())  # GDAL may take a relative path with a colon for a driver
+    name = str(path.absolute())  # GDAL may read `a:b` as DRIVER:FILE
     if page is not None and page.index:
         name = f"GTIFF_DIR:{page.index + 1}:{name}"
     # Files that GDAL cannot read have no georeference; a bad .prj file raises a ValueError.
@@ -266,7 +270,7 @@ def _kept_exif(exif: Any) -> Any:
     kept.update({code: exif[code] for code in EXIF_TEXTS if code in exif})
     for code in set(EXIF_DIRECTORIES).intersection(exif):
         kept.get_ifd(code).update(exif.get_ifd(code))
-        kept[code] = 0  # placeholder of a pointer, set on writing
+        kept[code] = 0  # placeholder; writing sets the pointer
     return kept
 
 
@@ -292,7 +296,7 @@ def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadat
     if suffix.startswith(".tif"):
         metadata.write_tiff(rgb, Path(path))
         return
-    # OpenCV would fail without a reason and log a warning.
+    # OpenCV would fail without giving a reason.
     if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
         size = f"{rgb.shape[1]}x{rgb.shape[0]}"
         raise DeepDetectError(

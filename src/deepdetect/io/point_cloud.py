@@ -1,4 +1,4 @@
-"""Writing point clouds: one registry of formats, chosen by the file's suffix."""
+"""Writing point clouds in one of several formats, which the file's suffix selects."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ VERTEX_WITH_NORMAL = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", 
 def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
     """Write binary PLY (Turk, 1994): float x y z, uchar red green blue; 15 bytes per point.
 
-    Normals are written between them as float nx ny nz, which makes 27 bytes per point. Frame, unit
-    and metadata become comments, which PLY libraries do not write; non-ASCII becomes "?".
+    If the cloud has normals, they are written between position and colour as float nx ny nz, which
+    makes 27 bytes per point. Frame, unit and metadata become comments, with "?" for each character
+    outside ASCII. PLY libraries do not write comments, so none is used.
     """
     vertices = np.empty(len(cloud), VERTEX if cloud.normals is None else VERTEX_WITH_NORMAL)
     names = "x y z" if cloud.normals is None else "x y z nx ny nz"
@@ -55,7 +56,7 @@ POINT_CLOUD_WRITERS: dict[str, PointCloudWriter] = {
     ".glb": write_glb,
     ".html": write_html_page,
 }
-"""Writers by suffix. New formats need a function `(cloud, path, metadata) -> None`, listed here."""
+"""Writers by suffix. To add a format, list a function `(cloud, path, metadata) -> None` here."""
 
 
 @suggest_keywords
@@ -93,12 +94,12 @@ def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | N
 
 
 def find_writer(path: str | Path) -> PointCloudWriter:
-    """Return the writer for a path; this also checks a suffix before expensive work."""
+    """Return the writer for a path's suffix; call it to check the suffix before expensive work."""
     return look_up("ending", Path(path).suffix.lower(), POINT_CLOUD_WRITERS)
 
 
 def format_metadata(metadata: Metadata) -> dict[str, str]:
-    """Format each value as one line: integers with commas, other numbers with four digits.
+    """Format each value as one line: integers with commas, others with 4 significant digits.
 
     Example:
         >>> format_metadata({"points": 49979, "within 1 px": 0.95312, "scene": "the  cones"})

@@ -24,13 +24,13 @@ from ..features.keypoints import Keypoints
 from ..features.matches import Evidence, Matches, TwoViewGeometry
 
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
-"""Attributes of keypoints that npz files contain if they are known."""
+"""These attributes of keypoints may be None. An npz file contains those that are not."""
 
 MATCH_VALUES = (
     *("points0", "points1", "scores", "inliers"),
     *("subpixel", "indices0", "indices1"),
 )
-"""Attributes of matches in npz files, in addition to their keypoints and geometry."""
+"""An npz file contains these attributes of `Matches`, in addition to keypoints and geometry."""
 
 CSV_ROWS = 100_000
 """CSV tables are written in blocks of this many rows. All rows at once would double the memory."""
@@ -90,11 +90,12 @@ def save_matches(matches: Matches, path: str | Path) -> None:
     Args:
         matches: the matches.
         path: ending in .npz or .csv. An npz file has the attributes of `Matches`: `points0` and
-            `points1` (M, 2) float32, `indices0` and `indices1` (M,) int32 rows of the keypoints,
-            `scores` (M,) float32, `inliers` (M,) bool and `subpixel` bool. For each image, here
-            the first, it has `keypoints0` (N, 2) float32, `keypoint_scores0` (N,) float32 and
-            `image_size0` (width, height). If there is a geometry, it has the strings `model`,
-            `scene` and `confidence`, the (3, 3) `matrix`, which is (0, 0) if unknown, and the
+            `points1` (M, 2) float32, `indices0` and `indices1` (M,) int32 (the rows of the matched
+            keypoints in `keypoints0` and `keypoints1`), `scores` (M,) float32, `inliers` (M,) bool
+            and `subpixel` bool. The keypoints of the first image are `keypoints0` (N, 2) float32,
+            `keypoint_scores0` (N,) float32 and `image_size0` (width, height); the names for the
+            second image end in 1. If there is a geometry, the file has the strings `model`, `scene`
+            and `confidence`, the (3, 3) `matrix` (if unknown, an empty (0, 0) array), and the
             numbers of `Evidence`.
             A CSV file has the columns x0, y0, x1, y1, score, inlier.
 
@@ -123,7 +124,7 @@ def load_matches(path: str | Path) -> Matches:
     """Read matches from the npz file that `save_matches` wrote.
 
     Returns:
-        The matches. Their `seconds` are empty, and their keypoints have no logits.
+        The matches. Their `seconds` are empty, and their keypoints have only positions and scores.
 
     Raises:
         DeepDetectError: the file is missing or has other content.
@@ -154,14 +155,14 @@ def load_matches(path: str | Path) -> Matches:
 def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
     """Yield the arrays of an npz file by name; arrays without dimensions become numbers or strings.
 
-    Errors, also those in the block, name the file and its expected content.
+    Errors, also those that the block raises, name the file and its expected content.
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             yield {name: _value(array) for name, array in arrays.items()}
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
-    except Exception as error:  # NumPy and the zip decoders raise many types
+    except Exception as error:  # NumPy and the zip decoders raise many types of errors
         missing = "it has no array " if isinstance(error, KeyError) else ""
         raise InvalidFileError(
             f"{path} contains no {content} ({missing}{first_line(error)}): write the file again"
@@ -183,7 +184,7 @@ def _format(path: str | Path) -> str:
 
 
 def _save_csv(path: str | Path, header: str, columns: list[np.ndarray]) -> None:
-    # Scores are ranks: 9 digits keep any two different float32 apart.
+    # Scores rank the keypoints, so all digits count: 9 digits tell any two float32 apart.
     digits = ["%.9g" if name == "score" else "%.7g" for name in header.split(",")]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(f"{header}\n".encode())

@@ -34,7 +34,8 @@ ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
 MAX_BYTES_PER_PIXEL = 256
-"""Files with more bytes per pixel are rejected, since a small file can claim any band count."""
+"""Files with more bytes per pixel are rejected, since a small file can claim to have any number of
+bands."""
 
 
 def read_tiff(
@@ -44,8 +45,8 @@ def read_tiff(
 
     Returns:
         (H, W, 3) RGB, not yet turned upright, and the EXIF orientation. RGB is uint8, or uint16 if
-        `deep` and the file has more bits. If `raw`, grey and RGB files give all their bands,
-        (H, W, C), in their own data type.
+        `deep` and the file has more than 8 bits per value. If `raw`, all bands of a grey or RGB
+        file are returned instead, (H, W, C), in their own data type.
 
     Raises:
         ImageError: as in `load_image`.
@@ -54,7 +55,7 @@ def read_tiff(
     from tifffile import TiffFile
 
     logger = logging.getLogger("tifffile")
-    if not logger.handlers:  # otherwise it writes to standard error
+    if not logger.handlers:  # otherwise tifffile writes to standard error
         logger.addHandler(logging.NullHandler())
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
@@ -74,11 +75,12 @@ def read_tiff(
             return read_tiff(filled, name, options, deep, raw)
         try:
             array = page.asarray(squeeze=False)
-        except Exception as error:  # tifffile and its decoders raise many types
+        except Exception as error:  # tifffile and its decoders raise many types of errors
             if "imagecodecs" not in str(error):
                 raise damaged_image(name, error) from None
             return _read_by_pillow(file, stored, page, name, options), 1
-        # (separate bands, depth, height, width, bands) to (height, width, bands).
+        # tifffile's axes are bands stored as planes, depth, height, width, bands stored per pixel.
+        # One of the two axes for bands has length 1. The result is (height, width, bands).
         bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
         orientation = int(page.tags.valueof(ORIENTATION, 1))
         if raw and photometric in (MIN_IS_BLACK, RGB):
@@ -125,7 +127,7 @@ def _to_rgb(
     photometric = int(page.photometric)
     chosen = _chosen_bands(bands, page, name, options)
     value, absent = no_data_of(page), None
-    if value:  # 0 is black already
+    if value:  # pixels with the value 0 are black already
         absent = (chosen == value) | (np.isnan(value) & np.isnan(chosen))
         chosen = np.where(absent, chosen.dtype.type(0), chosen)
     if photometric == PALETTE:
@@ -177,14 +179,18 @@ def _white(page: Any) -> int | None:
         return (1 << bits) - 1
     values = np.atleast_1d(page.tags.valueof(MAX_SAMPLE_VALUE, 0))
     largest = int(values.max())
-    # In the standard the tag is the largest pixel value. If it is 2^n - 1, it tells white.
+    # The standard says that the tag holds the largest value of a pixel, which need not be white.
+    # If it is 2^n - 1, though, it is taken for the value of white.
     return largest if largest > 255 and not largest & (largest + 1) else None
 
 
 def _read_by_pillow(
     file: BinaryIO, stored: list[Any], page: Any, name: str, options: ReadingOptions
 ) -> np.ndarray:
-    """Decode by Pillow what tifffile cannot without imagecodecs; raise if Pillow cannot, either."""
+    """Decode with Pillow a page that tifffile could only decode if imagecodecs were installed.
+
+    Raise a MissingExtraError if Pillow cannot decode it correctly.
+    """
     bits, photometric = page.bitspersample, int(page.photometric)
     plain = page.dtype.kind in ("b", "u") and (
         bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)

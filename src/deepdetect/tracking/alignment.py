@@ -1,7 +1,8 @@
-"""Alignment of patches of an image in later images, with an affine deformation, by Gauss-Newton.
+"""Finding patches of one image in later images, with an affine deformation, by Gauss-Newton.
 
 The method is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004):
-everything but the residuals is computed once for each patch. Gain and offset are eliminated.
+everything but the residuals is computed once for each patch. Gain and offset of the brightness are
+eliminated.
 """
 
 from __future__ import annotations
@@ -14,43 +15,47 @@ import numpy as np
 from .._shared.opencv import cv2
 
 RADIUS_PX = 10
-"""Radius of a patch, whose pixels have a Gaussian weight of sigma radius / 2. Chosen by hand."""
+"""A patch is a square that reaches this far from its central pixel. Its pixels have Gaussian
+weights whose sigma is half of this. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
-"""Sigma of the blur of images, so that values between pixels can be interpolated well."""
+"""Images are blurred with this sigma, so that values between pixels can be interpolated well."""
 
 BORDER_PX = 3
-"""Width of the border that is not used: it is blurred with values from beyond the image."""
+"""A border of this width is not used, because its blurred values depend on padding."""
 
 MAX_ITERATIONS = 30
 CONVERGENCE_PX = 0.03
-"""A patch that moves by less has converged. OpenCV 4 reads images at steps of 1/32 px."""
+"""A patch that moves by less than this in an iteration has converged. A smaller limit would not
+help, because OpenCV 4 interpolates images at steps of 1/32 px."""
 
 MAX_SHIFT_PX = 3.0
-"""A patch may move by this much from its expected position. Tracking by translation alone has such
-errors where surfaces come nearer. Chosen by hand."""
+"""A patch is searched up to this distance from its expected position. Expected positions come from
+tracking by translation alone, which can be wrong by that much where surfaces come nearer. Chosen by
+hand."""
 
 MIN_CORRELATION = 0.8
-"""A patch that correlates less is not found. Chosen by hand."""
+"""A patch counts as found if its correlation with the image is at least this. Chosen by hand."""
 
 MAX_GROWTH = 4.0
 """The area of a patch may grow or shrink by this factor. If it changes more, one of the images
 shows too few of its pixels. Chosen by hand."""
 
 RIDGE = 1e-4
-"""This share of the scale of the normal equations is added to their diagonal, because parallel
-edges make them singular. Chosen by hand."""
+"""This fraction of the scale of the normal equations is added to their diagonal, because they are
+singular for a patch that shows only parallel edges. Chosen by hand."""
 
 MOST_READ = 1 << 14
-"""Number of patches read at once, since OpenCV limits the sides of an image to 32,767."""
+"""Patches are read in groups of at most this many, since OpenCV limits the sides of an image to
+32,767."""
 
 
 class Patches(NamedTuple):
-    """Patches of P pixels: float32 values (N, P), steps (N, 6, P), and variances (N,).
+    """N patches of P pixels each: float32 values (N, P), steps (N, 6, P) and variances (N,).
 
-    Steps map residuals to changes of the position (2) and of the deformation (4, row by row).
-    `affinities` (N, 2, 2) float64 map offsets of pixels in the patches to offsets in the image in
-    which they were found last.
+    The steps of a patch map its P residuals to changes of its position (2 numbers) and of its
+    deformation (4 numbers, row by row). `affinities` (N, 2, 2) float64 map offsets of pixels from
+    the centre of a patch to offsets in the image in which it was found last.
     """
 
     values: np.ndarray
@@ -67,12 +72,15 @@ class Patches(NamedTuple):
         return cls(values, steps, np.empty(0, np.float32), np.empty((0, 2, 2)))
 
     def select(self, rows: np.ndarray) -> Patches:
-        """Return some of the patches, by a mask or by rows."""
+        """Return some of the patches; `rows` is a mask or indices."""
         return Patches(*(each[rows] for each in self))
 
 
 def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
-    """Return patches around (N, 2) points of a blurred image, empty ones at its border."""
+    """Return patches around (N, 2) points of a blurred image.
+
+    Patches too near to the border of the image are all zero, and so are never found.
+    """
     offsets, weights = _pixels()
     affinities = np.tile(np.eye(2), (len(xy), 1, 1))
     slopes = [
@@ -103,8 +111,8 @@ def find_patches(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find patches in a blurred image near (N, 2) expected positions.
 
-    Returns (N, 2) positions and (N, 2, 2) affinities, float64, and (N,) bool whether each was
-    found. Positions and affinities of patches that were not found are meaningless.
+    Returns the (N, 2) positions and (N, 2, 2) affinities of the patches, float64, and (N,) bool:
+    whether each patch was found. If it was not, its position and affinity are meaningless.
     """
     found, affinities = xy.astype(np.float64), patches.affinities.copy()
     arrived = np.zeros(len(xy), bool)
@@ -143,9 +151,10 @@ def _pixels() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
-    """Return the (N, P) values of an image around points, at offsets warped by the affinities.
+    """Return the (N, P) values of an image at the pixels of N patches warped by the affinities.
 
-    The kernel is Lanczos': OpenCV's cubic kernel shifts what it reads by up to 0.05 px.
+    Values are interpolated with the Lanczos kernel, because OpenCV's cubic kernel shifts them by up
+    to 0.05 px.
     """
     places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ _pixels()[0]
     parts = np.array_split(places, len(places) // MOST_READ + 1)

@@ -25,7 +25,8 @@ from .tracks import TrackDrawer, TrackedFrame, write_tracks
 from .video import Frame, FrameSource, check_video_name, write_video
 
 MIN_SIDE_PX = 32
-"""`max_side`, the longer side of scaled frames, must be at least this. Chosen by hand."""
+"""`max_side`, the length of the longer side of scaled frames, must be at least this. Chosen by
+hand."""
 
 RATE_FRAMES = 10
 """The displayed frame rate is a mean over this number of frames."""
@@ -43,7 +44,7 @@ class TrackingReport:
         fps: frames processed per second, including drawing and writing.
         seconds: total time.
         files: files that were written.
-        expected: number of frames that the source states, or None; a truncated file has fewer.
+        expected: number of frames that the source states, or None. A truncated file has fewer.
         failures: a sentence on each frame of a folder that was left out.
     """
 
@@ -72,10 +73,12 @@ def track_frames(
     Args:
         source: a source that was opened in a `with` block.
         tracker: a new tracker.
-        max_side: longer side in pixels that frames are scaled down to for the tracker.
+        max_side: frames whose longer side has more pixels than this are scaled down to it for the
+            tracker. None: frames are not scaled.
 
     Returns:
-        Iterator over each frame, (H, W, 3) uint8 RGB, and its tracks, in pixels of this frame.
+        Iterator over pairs of a frame, (H, W, 3) uint8 RGB, and its tracks. Positions are in pixels
+        of this frame, not of the scaled one.
 
     Raises:
         OptionError: `max_side` is too small.
@@ -113,20 +116,22 @@ def track(
 ) -> TrackingReport:
     """Follow the points of a video; write a video with the tracks, and a CSV file of them.
 
-    Ctrl-C, SIGTERM or SIGHUP (a closed terminal) ends the recording of a camera, and both files are
-    written. Images of a folder that cannot be read, or differ in size from the first one, are left
-    out and named in the report.
+    A recording of a camera runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal) ends it; both
+    files are then finished. Images of a folder that cannot be read, or differ in size from the
+    first one, are left out and named in the report.
 
     Args:
         source: a video file, a folder of images, or the number of a camera.
         output: video ending in .mp4, .mov, .mkv or .avi; the CSV file next to it has the columns
             frame, track, x, y and score. If it ends in .csv, no video is written.
-        detector: detector of the points; None: a `PointDetector` with enough candidates.
+        detector: detector of the points. None: a `PointDetector` that finds `CANDIDATES` times as
+            many points as tracks are wanted.
         options: how points are followed.
         every: process every N-th frame.
         max_frames: largest number of frames that are taken. None: all.
-        max_side: longer side in pixels that frames are scaled down to for the tracking.
-        tail: number of past positions of a track that are drawn.
+        max_side: frames whose longer side has more pixels than this are scaled down to it for the
+            tracking only. None: no limit.
+        tail: number of positions of a track that are drawn: the last ones.
         quiet: show no progress bar.
 
     Returns:
@@ -194,9 +199,10 @@ def output_files(output: str | Path) -> tuple[Path | None, Path]:
 
 @contextmanager
 def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C, SIGTERM or SIGHUP for a live source, so that its files are finished.
+    """Yield a function that tells whether a signal has asked to end the recording of a live source.
 
-    A second signal ends the process at once, and leaves no file.
+    The first Ctrl-C, SIGTERM or SIGHUP is only noted, so that the files are finished. A second one
+    ends the process at once, and leaves no file.
     """
     noted: list[int] = []
     with ExitStack() as handlers:

@@ -1,10 +1,10 @@
 """Tracking of points from frame to frame by pyramidal Lucas-Kanade.
 
-Lucas and Kanade, "An iterative image registration technique", 1981, with Bouguet's pyramid. Tracks
-that do not come back to where they started are dropped (Kalal et al., "Forward-backward error",
-2010). Each point is then aligned with its first patch under an affine deformation, so that errors
-hardly add up (Shi and Tomasi, "Good features to track", 1994). The best keypoints that are far
-enough from all tracks begin new ones.
+Lucas and Kanade, "An iterative image registration technique", 1981, with Bouguet's pyramid. Each
+point is followed to the next frame and back, and dropped if it does not come back to where it was
+(Kalal et al., "Forward-backward error", 2010). The others are aligned with the patch around their
+first position, under an affine deformation, so that errors hardly add up (Shi and Tomasi, "Good
+features to track", 1994). The best keypoints that are far enough from all tracks begin new tracks.
 """
 
 from __future__ import annotations
@@ -30,16 +30,18 @@ Detect = Callable[[np.ndarray], Keypoints]
 """Function that returns the keypoints of a (H, W, 3) uint8 RGB image."""
 
 CANDIDATES = 3
-"""This multiple of the wanted tracks is detected as keypoints, to choose some that lie apart."""
+"""The default detector finds this many keypoints for each track that is wanted, so that enough of
+them are far from existing tracks and from each other."""
 
 MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
-"""A new point is at least the first distance from all tracks, in pixels, and the second share of
-the spacing of a grid of `max_keypoints` points. Points all over the image tell more about the
-motion of the camera."""
+"""A new point keeps a distance from all tracks: at least the first number, in pixels, and at least
+the second number times the spacing that a grid of `max_keypoints` points over the image would have.
+Points all over the image tell more about the motion of the camera."""
 
 WINDOW_PX, LEVELS = 21, 3
 """The first is the side of the patch that is followed. The second is the number of pyramid levels
-above the image. Each doubles how far points may move between frames. Both are OpenCV's defaults."""
+above the image; each level doubles how far points may move between frames. Both numbers are
+OpenCV's defaults."""
 
 BORDER_PX = 2.0
 """Points nearer to the border of the image are dropped. Chosen by hand."""
@@ -52,9 +54,11 @@ class TrackingOptions:
 
     Attributes:
         max_keypoints: largest number of tracks at a time.
-        detect_every: detect new points after this many frames, or once many tracks are lost.
-        min_kept: detect new points if fewer than this share of the last tracks is left.
-        max_return_error_px: largest error of a point after following it forward and back.
+        detect_every: detect new points after this many frames, or earlier if many tracks are lost.
+        min_kept: detect new points early if less than this fraction is left of the tracks that
+            there were after the last detection.
+        max_return_error_px: drop a point if, followed to the next frame and back, it ends farther
+            than this from where it was, in pixels.
 
     Raises:
         OptionError: a value is out of its range.
@@ -96,7 +100,7 @@ class Tracker:
         self.detect, self.options = detect, options
         self._gray: np.ndarray | None = None
         self._frames = self._since_detection = self._next_track = 0
-        self._most = 0  # tracks after the last detection
+        self._most = 0  # number of tracks after the last detection
         self._points: dict[str, np.ndarray] = {
             "tracks": np.empty(0, np.int64),
             "xy": np.empty((0, 2), np.float32),
@@ -109,11 +113,11 @@ class Tracker:
     def update(
         self, image: Any, *, number: int | None = None, channels: Channels = "rgb"
     ) -> TrackedFrame:
-        """Follow all points into the next frame, and begin new tracks if there are few.
+        """Follow all points into the next frame, and begin new tracks when the options say so.
 
         Args:
             image: an image as for `DeepDetect.detect`, of the same size as earlier frames.
-            number: number of the frame; None: the number of earlier frames.
+            number: number of the frame; None: frames are counted from 0.
             channels: order of the colours.
 
         Raises:
@@ -200,9 +204,11 @@ class Tracker:
 def free_keypoints(
     keypoints: Keypoints, taken: np.ndarray, distance_px: float, count: int
 ) -> np.ndarray:
-    """Choose up to `count` keypoints, the best first, far from (M, 2) positions and each other.
+    """Choose up to `count` keypoints, best first, that are far from tracks and from each other.
 
-    Returns (K,) rows of the keypoints. Distances are between the nearest whole pixels.
+    `taken` are the (M, 2) positions of the tracks. Returns the (K,) indices of the chosen
+    keypoints. Positions are rounded to whole pixels before their distance is compared with
+    `distance_px`.
     """
     width, height = keypoints.image_size
     radius = int(distance_px)

@@ -19,7 +19,8 @@ from ..viz.draw import line_scale
 HEADER = "frame,track,x,y,score"
 
 HUE_STEP = 0.61803
-"""Step of the hue from one track to the next: the golden ratio keeps successive tracks distinct."""
+"""The hue advances by this fraction of the colour circle from one track to the next. With the
+golden ratio, tracks with successive numbers get clearly different colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +29,11 @@ class TrackedFrame:
 
     Attributes:
         number: number of the frame in the source, from 0 on.
-        tracks: (N,) int64 numbers of the tracks, ascending; a track keeps its number.
-        xy: (N, 2) float32 positions, centre of the first pixel (0, 0).
+        tracks: (N,) int64 numbers of the tracks, ascending; a track has the same number in all
+            frames.
+        xy: (N, 2) float32 positions in pixels; the centre of the first pixel is (0, 0).
         scores: (N,) float32 scores of the keypoints with which the tracks began.
-        ages: (N,) int64 frames since the tracks began, 0 if a track begins here.
+        ages: (N,) int64 number of frames since each track began, 0 if it begins here.
 
     Raises:
         OptionError: the arrays do not have one row for each track.
@@ -57,7 +59,7 @@ class TrackedFrame:
 
 @contextmanager
 def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
-    """Open a CSV file of tracks, which appears when the block ends, whole or not at all.
+    """Open a CSV file of tracks, which appears, complete, only if the block ends without an error.
 
     The block gets a function that writes the rows of a frame: frame, track, x, y and score.
     """

@@ -26,10 +26,11 @@ from ..io.image import find_images, load_image
 from ..io.image_file import IMAGE_SUFFIXES
 
 FOLDER_FPS = 10.0
-"""Frame rate assumed for a folder of frames, and for a video that states none."""
+"""This rate, in frames per second, is assumed for folders and for videos that state no rate."""
 
 MAX_FPS = 1000.0
-"""A frame rate in a file above this is wrong, and ignored. Chosen by hand."""
+"""If a file states more frames per second than this, its rate is wrong, and `FOLDER_FPS` is used.
+Chosen by hand."""
 
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
@@ -60,10 +61,11 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
     Attributes:
         live: whether the source is a camera, which has no end.
-        fps: frames per second, after `every`.
-        count: number of frames that will be taken, as the file states; None if unknown.
-        failures: a sentence on each image of a folder that was left out so far, because it cannot
-            be read or differs in size from the first one.
+        fps: frames per second of the frames that are taken: the source's rate divided by `every`.
+        count: number of frames that will be taken if the file states its length correctly; None if
+            unknown.
+        failures: a sentence on each image of a folder that has been left out so far, because it
+            cannot be read or differs in size from the first one.
 
     Raises:
         MissingFileError: there is no such file, folder or camera.
@@ -168,7 +170,7 @@ def count_frames(path: Path) -> int:
     """Return the number of frames of a video file that can be read in sequence."""
     backend, settings = cv2.CAP_ANY, []
     if cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends():
-        # FFmpeg can leave frames undecoded, which takes a fiftieth of the time.
+        # FFmpeg can leave frames undecoded, which needs only a fiftieth of the time.
         backend, settings = cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1]
     capture = cv2.VideoCapture(str(path), backend, settings)
     frames = next(number for number in count() if not capture.grab())
@@ -186,10 +188,10 @@ def check_video_name(path: str | Path) -> str:
 
 @contextmanager
 def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Open a video file, which appears when the block ends, whole or not at all.
+    """Open a video file, which appears, complete, only if the block ends without an error.
 
-    The block gets a function that writes a (H, W, 3) uint8 RGB frame; all must have one size. The
-    finished file is checked, because OpenCV does not report a frame that it could not write.
+    The block gets a function that writes a (H, W, 3) uint8 RGB frame; all frames must have the same
+    size. The finished file is checked, because OpenCV does not report frames that it cannot write.
 
     Raises:
         DeepDetectError: the file cannot be written (the disk may be full), or has no frames.

@@ -17,7 +17,7 @@ DEVELOPMENT = {
         "datasets": ("deepdetect_lab.cli.datasets", "Download data sets."),
         "benchmark": (
             "deepdetect_lab.cli.evaluate",
-            "Compute the tables and figures of the paper, with other detectors for comparison.",
+            "Compute the paper's tables and figures, with other detectors for comparison.",
         ),
         "evaluate": ("deepdetect_lab.cli.evaluate", "Score weights on images with known masks."),
         "compare-clouds": (
@@ -26,7 +26,7 @@ DEVELOPMENT = {
         ),
         "evaluate-stereo": (
             "deepdetect_lab.cli.evaluate",
-            "Count correct stereo matches for weights and for label settings.",
+            "Compare weights and label settings by correct matches of stereo pairs.",
         ),
     },
     "Weights": {
@@ -36,7 +36,7 @@ DEVELOPMENT = {
             "deepdetect_lab.cli.train",
             "Train the network that separates correct matches from wrong ones.",
         ),
-        "average": ("deepdetect_lab.cli.train", "Average several weights."),
+        "average": ("deepdetect_lab.cli.train", "Average several sets of weights into one."),
     },
 }
-"""Commands of `deepdetect dev`, in the same form."""
+"""Commands of `deepdetect dev`, in the same form as `COMMANDS`."""

@@ -39,7 +39,10 @@ MEASURES = cli.From(
 
 @cli.command(MEASURES, NETWORK)
 def evaluate(
-    samples: Annotated[Path, Parameter(help="Folder of image_NAME.png with mask_image_NAME.png.")],
+    samples: Annotated[
+        Path,
+        Parameter(help="Folder of images image_NAME.png and their masks mask_image_NAME.png."),
+    ],
     /,
     *,
     compare: list[str] | None = None,
@@ -48,19 +51,20 @@ def evaluate(
 ) -> cli.Result:
     """Score the network on a folder of images with known masks.
 
-    Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), the expected
-    calibration error over all pixels, and the density of keypoints at 0.5 and of the masks,
-    separately for normal and for low-visibility images. With --oxford it also prints the scores of
-    the paper's protocol. Unreadable files are listed at the end and are not in the scores.
+    Prints, separately for images of normal and of low visibility: the mean binary cross-entropy
+    (BCE) and intersection over union (IoU), the expected calibration error over all pixels, the
+    fraction of pixels that are keypoints (probability above 0.5), and the fraction that the masks
+    mark. With --oxford it also prints the scores of the paper's protocol. Unreadable files are
+    listed at the end and are not in the scores.
 
         deepdetect dev evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
         deepdetect dev evaluate photos/ --scale 0.5 --scale 1 --scale 2
         deepdetect dev evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
 
     Args:
-        compare: Evaluate these weights too, next to the first; may be repeated.
-        scale: Score the images scaled by this factor too, on labels of their own; may be repeated.
-            The images then need no masks.
+        compare: Further weights to evaluate, shown next to those of --weights; may be repeated.
+        scale: Also score the images scaled by this factor, against labels that are made from the
+            scaled images; may be repeated. The images then need no masks.
     """
     measures = MEASURES.take(values)
     measures |= {"samples": samples, "scales": tuple(scale or ()), "quiet": False}
@@ -80,7 +84,7 @@ def evaluate(
     ]
     text = cli.table(*({**c, "scales": s} for c, s in zip(columns, by_scale, strict=True)))
     failures = [failure for score in scores if score is not None for failure in score.failures]
-    # Failures that all weights share are listed once.
+    # A failure that is the same for several weights is listed once.
     return cli.Result(report, text, list(dict.fromkeys(failures)), what="parts")
 
 
@@ -116,16 +120,17 @@ def evaluate_stereo(
 ) -> cli.Result:
     """Match rectified stereo pairs and evaluate the matches with the true disparity.
 
-    Matching uses neither the rectification nor the true disparity. A match is correct within 1 px.
-    Random points of the same density and all pixels are the baselines.
+    Matching uses neither the rectification nor the true disparity. A match is correct if it is
+    within 1 px of the ground truth. For comparison, random points of the same density, and all
+    pixels, are matched in the same way.
 
         deepdetect dev evaluate-stereo cones/ teddy/ --weights default --weights dense
         deepdetect dev evaluate-stereo cones/ teddy/ --label-settings mine.toml
 
     Args:
         weights: Pretrained weights (default, dense, free or espnet), or a file; may be repeated.
-        label_settings: Label settings (paper or dense), or a file: the labels are the keypoints,
-            without a network; may be repeated.
+        label_settings: Label settings (paper or dense), or a TOML file. Their labels are matched
+            as keypoints, without a network; may be repeated.
     """
     pairs: list[StereoPair] = []
     failures: list[str] = []
@@ -146,7 +151,7 @@ def evaluate_stereo(
 
 @cli.command()
 def compare_clouds(
-    model: Annotated[Path, Parameter(help="Folder of `deepdetect reconstruct`.")],
+    model: Annotated[Path, Parameter(help="Folder that `deepdetect reconstruct` wrote.")],
     /,
     *clouds: Annotated[Path, Parameter(help="PLY files in the frame of the model.", required=True)],
 ) -> cli.Result:
@@ -196,9 +201,9 @@ def benchmark(
             [default: all except degraded]
         method: A further method: NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
         baselines: Classical methods, separated by commas, or none. [default: all]
-        preset: published: give the network BGR images, as the paper's code does.
-        cache: Folder for cached results.  [default: cache in the output]
-        geometry_weights: Name or file of weights for stereo pairs; may be repeated.
+        preset: "published" gives the network BGR images, as the paper's code does; "default" RGB.
+        cache: Folder for cached results.  [default: the folder cache in the output]
+        geometry_weights: Name or file of the weights that match stereo pairs; may be repeated.
             [default: dense]
     """
     output = cli.output_folder(output)

@@ -89,7 +89,8 @@ def chosen_label_settings(
     Args:
         detectors: Detectors, separated by commas: sift, orb, brisk, fast, agast, harris,
             shi-tomasi, canny, sobel.  [default: all]
-        label_settings: Detectors and their settings: paper, dense, or a file.  [default: paper]
+        label_settings: Detectors and their settings: paper, dense, or a TOML file.
+            [default: paper]
     """
     settings = find_label_settings(label_settings or "paper")
     if detectors is None:
@@ -107,8 +108,9 @@ def chosen_recipe(
     """Return a preset's training options with the given values changed.
 
     Args:
-        preset: Recipe, which other options change: default (its values are shown here), dense
-            (normal light only, denser labels), espnet (ESPNet), or paper (ESPNet as in the paper).
+        preset: Recipe, whose values other options override: default (its values are shown here),
+            dense (normal light only, denser labels), espnet (trains ESPNet), or paper (trains
+            ESPNet as in the paper).
     """
     if "stages" in values:
         values["stages"] = tuple(map(Stage.parse, values["stages"]))
@@ -116,7 +118,7 @@ def chosen_recipe(
     labels = chosen_label_settings(detectors, label_settings)
     if label_settings is not None:
         values["labels"] = labels
-    elif detectors is not None:  # the preset's settings of the chosen detectors
+    elif detectors is not None:  # keep the preset's settings for these
         values["labels"] = recipe.labels.with_detectors(labels.detectors)
     return replace(recipe, **values)
 
@@ -136,10 +138,10 @@ def train(
 ) -> cli.Result:
     """Train the network on the images, or the shards, in a folder.
 
-    First, labels are made once by the detectors of `deepdetect label`. The output folder gets
-    checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights with the lowest
-    validation loss), and the loss curves curves.csv and curves.png. Run the same command again to
-    resume an interrupted run.
+    First, labels are made once by the detectors of `deepdetect label`. The output folder gets the
+    weights with the lowest validation loss (best.safetensors and deepdetect.onnx), the loss curves
+    (curves.csv and curves.png), and checkpoint.safetensors, from which the same command resumes an
+    interrupted run.
 
         deepdetect train photos/ -o run
         deepdetect detect photo.jpg --weights run/deepdetect.onnx
@@ -233,8 +235,8 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """Pack the images in a folder with their labels into tar files.
 
     The files have WebDataset's layout. Training reads a few of them at a time, so they may be on a
-    slow disk or a network drive. Give both commands the same options. Run the same command again to
-    resume after an interruption.
+    slow disk or a network drive. Give `train` the same options as this command. Run the same
+    command again to resume after an interruption.
 
         deepdetect dev shards --preset paper data/coco -o data/shards
         deepdetect train --preset paper data/shards -o run
@@ -244,7 +246,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """
     folder = cli.output_folder(output)
     how = SHARDS_RUN.take(values)
-    # Shards fit any stages, so a stage for every size is given here.
+    # Shards do not depend on the stages, so this one stands for any: its crops fit every size.
     recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
     made = write_shards(images, folder, recipe, quiet=False, **how)
     return cli.Result(
@@ -278,7 +280,8 @@ def label(
 
     Args:
         output: Folder for the masks.
-        visualize: Also write STEM_labels.png, the paper's Figure 4.
+        visualize: Also write STEM_labels.png: image, keypoint mask, edge mask and both combined, as
+            in the paper's Figure 4.
         workers: Number of processes.  [default: one per processor]
     """
     folder = cli.output_folder(output)
@@ -318,7 +321,8 @@ def average(
     *weights: Annotated[
         str,
         Parameter(
-            help=".safetensors files, or default, dense, free or espnet; repeat one to double it.",
+            help=".safetensors files, or default, dense, free or espnet; repeat one to count it "
+            "twice.",
             required=True,
         ),
     ],
@@ -327,8 +331,8 @@ def average(
 ) -> cli.Result:
     """Average weights (a model soup) into best.safetensors and deepdetect.onnx.
 
-    The mean of successive runs is often better than each of them. A single file is just converted
-    to ONNX. Files of another run are only replaced with --overwrite.
+    The mean of the weights of successive runs is often better than those of each run. A single file
+    is just converted to ONNX. Files of another average are only replaced with --overwrite.
 
         deepdetect dev average first/best.safetensors second/best.safetensors -o mean
         deepdetect dev evaluate samples/ --weights mean/deepdetect.onnx
