@@ -169,7 +169,8 @@ class PointDetector:
         """Detect the best keypoints of several images.
 
         Args:
-            images: a list or tuple of images, whose sizes may differ, or an array of four dimensions.
+            images: a list or a tuple, whose images may differ in size, or an array of four
+                dimensions.
             ignore: one mask for all images, or a list or tuple with a mask or None for each image.
             max_keypoints, channels: see `detect`.
 
@@ -257,7 +258,7 @@ class PointDetector:
         size = (gray.shape[1], gray.shape[0])
         scaled = size != (width, height)
         if scaled and ignore is not None:
-            # A pixel of the scaled image is ignored if it, or one next to it, covers an ignored one.
+            # A scaled pixel is ignored if it, or one next to it, covers an ignored pixel.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
         with memory_named(gray.shape), limited_threads(self.threads):
@@ -275,7 +276,7 @@ class PointDetector:
         )
 
     def _scaled(self, gray: np.ndarray) -> np.ndarray:
-        """Return the image in which keypoints are found, scaled down if `resolution` asks for it."""
+        """Return the image in which keypoints are found, scaled down if necessary."""
         height, width = gray.shape
         scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
         if self.resolution == "native" or scale >= 1:

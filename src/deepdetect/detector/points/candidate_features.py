@@ -13,16 +13,16 @@ from ..._shared.machine import parallel_for
 from .hessian_scales import SIGMAS_PX, VARIANCES, Candidates, ScaleSpace
 
 RING_RADII = (1.0, 2.0, 3.5, 6.0)
-"""Radii of the rings on which the image is sampled around a candidate, in sigmas of its scale. Chosen
-by hand."""
+"""Radii of the rings on which the image is sampled around a candidate, in sigmas of its scale.
+Chosen by hand."""
 
 RING_POINTS = 8
 """Number of sampled points on each ring, at equal angles. Chosen by hand."""
 
 FEATURES = 23 + 8 * len(RING_RADII)
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
-"""These are added to |det Hessian|, to squared gradients, and to the strengths by which features are
-divided, so that noise and rounding have little effect on logarithms and quotients."""
+"""These are added to |det Hessian|, to squared gradients, and to the strengths by which features
+are divided, so that noise and rounding have little effect on logarithms and quotients."""
 
 
 def ring_offsets() -> np.ndarray:

@@ -59,8 +59,8 @@ def describe_learned(
         return replace(keypoints, descriptors=none, descriptor_type=kind)
     if keypoints.sizes is None or not (keypoints.sizes > 0).all():
         raise OptionError(
-            "learned descriptors need keypoints with sizes above 0: use those of a PointDetector, or "
-            "RootSIFT"
+            "learned descriptors need keypoints with sizes above 0: use those of a PointDetector, "
+            "or RootSIFT"
         )
     height, width = gray.shape
     factor = np.divide((width, height), keypoints.image_size).astype(np.float32)

@@ -40,8 +40,8 @@ DISTANCE_PX = 2.0
 less than 0.003."""
 
 DISTANCE_PER_SIGMA = 1.0
-"""Minimum distance between two keypoints, in sigmas of the smaller one, so that one structure is not
-found at several scales. It raised the ranker's score on photos/val from 0.539 to 0.543."""
+"""Minimum distance between two keypoints, in sigmas of the smaller one, so that one structure is
+not found at several scales. It raised the ranker's score on photos/val from 0.539 to 0.543."""
 
 SIZE_PER_SIGMA = 2.5
 """The size of a keypoint, the diameter that descriptors use, is this many times the sigma of its

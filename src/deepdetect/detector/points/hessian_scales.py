@@ -13,14 +13,16 @@ NMS_RADIUS = 2
 """A candidate is the maximum of its level within this many pixels in x and y. Chosen by hand."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
-"""Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Seven levels give candidates.
-The finest and the two coarsest levels only serve the features for ranking. Chosen by hand."""
+"""Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Candidates come from seven
+levels. The finest level and the two coarsest ones only serve the features for ranking. Chosen by
+hand."""
 
 VARIANCES = (SIGMAS_PX**2).astype(np.float32)
 """Squares of `SIGMAS_PX`, which normalise the derivatives."""
 
 LEAST_RESPONSE = 1e-8
-"""Minimum |det Hessian| of a candidate in an image with values in [0, 1]: less is rounding error."""
+"""Minimum |det Hessian| of a candidate in an image with values in [0, 1]: anything less is a
+rounding error."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The ranker: a small network that ranks candidates by how likely another image shows them again."""
+"""The ranker: a small network that orders candidates by how likely another image shows them."""
 
 from __future__ import annotations
 
