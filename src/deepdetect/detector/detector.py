@@ -75,7 +75,8 @@ class DeepDetect:
             paper's published code. For images read by OpenCV keep "rgb", and call the methods with
             `channels="bgr"`.
         tta: "none", or "flip", which averages the logits over eight flips and quarter turns of the
-            image. It takes eight times as long, but flipped or turned images get the same keypoints.
+            image. It takes eight times as long, but a flipped or turned image gets the same
+            keypoints.
         tile_megapixels: size, in megapixels, of the tiles into which larger images are divided if
             the resolution is "native". Tiles take less memory and about twice the time. "auto": an
             image is divided only if memory is short. The weights "espnet" cannot run in tiles, only
@@ -126,7 +127,7 @@ class DeepDetect:
 
     @classmethod
     def from_pretrained(cls, folder: str | Path, **options: Any) -> Self:
-        """Load the network `deepdetect.onnx` of a folder, as `train` and model hubs write it.
+        """Load `deepdetect.onnx` from a folder that `deepdetect train` or a model hub has written.
 
         Args:
             folder: a folder on this computer; nothing is downloaded.

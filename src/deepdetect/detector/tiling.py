@@ -50,7 +50,8 @@ MARGIN = 4
 depend on pixels up to 28 px away."""
 
 BYTES_PER_PIXEL = 90
-"""Approximate memory of a run without tiles, in bytes per pixel, in ONNX Runtime and in OpenVINO."""
+"""Approximate memory of a run without tiles, in bytes per pixel of the image, for ONNX Runtime and
+for OpenVINO."""
 
 DEFAULT_TILE_MEGAPIXELS = 2.7
 
@@ -106,7 +107,7 @@ class TiledNetwork:
 
 
 def open_tiled(path: Path, threads: int | None = None) -> TiledNetwork | None:
-    """Return the network of an ONNX file cut into parts, or None if it is not the network `fast`."""
+    """Return the network of an ONNX file, cut into parts; None if it is not the network `fast`."""
     state = path.stat()
     return _open(path.absolute(), threads, (state.st_mtime_ns, state.st_size))
 
@@ -154,7 +155,7 @@ class _Span(NamedTuple):
 
 
 def _spans(length: int, side: int) -> list[_Span]:
-    """Divide a length into the fewest equal parts no longer than `side`, including their margins."""
+    """Divide a length into the fewest equal parts that, with margins, are at most `side` long."""
     count = 1
     while (core := -(-length // count)) + MARGIN * min(count - 1, 2) > side and core > MARGIN:
         count += 1

@@ -50,8 +50,8 @@ def as_logits(
 ) -> np.ndarray:
     """Check a network's output, and convert it to (N, 1, H, W) float32 logits.
 
-    Probabilities that float32 rounds to 0 or 1 are moved slightly inwards before they are converted,
-    because their logits would be infinite.
+    Probabilities that float32 rounds to 0 or 1 are first moved slightly inwards, because their
+    logits would be infinite.
     """
     wanted = (image_shape[0], 1, *image_shape[2:])
     if output.shape != wanted or output.dtype != np.float32:

@@ -31,7 +31,7 @@ FLOAT = 1
 
 
 def cut_onnx(model: bytes, inputs: Collection[str], outputs: Collection[str]) -> bytes:
-    """Return the part of an ONNX file that computes the tensors `outputs` from `inputs`, all float32.
+    """Return the part of an ONNX file that computes `outputs` from `inputs`, all float32 tensors.
 
     A KeyError names a tensor that is missing or cannot be computed from the inputs.
     """
