@@ -87,7 +87,7 @@ def filter_matches(
 def filter_inputs(
     features0: Keypoints, features1: Keypoints, matches: DescriptorMatches
 ) -> dict[str, np.ndarray]:
-    """Return the inputs of the filter's network by name, with the rotation between images undone."""
+    """Return the network's inputs by name, with the rotation between the two images undone."""
     sizes, angles = [], []
     for features, rows in ((features0, matches.indices0), (features1, matches.indices1)):
         assert features.sizes is not None

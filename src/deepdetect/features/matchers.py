@@ -87,7 +87,7 @@ def exact_neighbours(
 def _search_both_ways(
     queries: np.ndarray, base: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `exact_neighbours`, and the nearest query of each of the M rows of the base, (M,) int32."""
+    """Return `exact_neighbours`, and the nearest query of each row of the base, (M,) int32."""
     from .kernels import scan_products
 
     width = base.shape[1]
