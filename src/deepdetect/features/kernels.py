@@ -181,8 +181,8 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
 def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
     """Find, for each position, the nearest of (M, 2) keypoints in the 3x3 pixels around it.
 
-    `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. The nearest row of a position
-    is not written if the position is not finite or has no keypoint in these pixels.
+    `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. `nearest` is not written for
+    positions that are not finite or have no keypoint in these pixels.
     """
     height, width = grid.shape
     for k in range(first, last):
@@ -230,9 +230,9 @@ def scan_products(products, terms0, terms1, start, rows, values, nearest, best, 
 
     Squared distances are `terms0[i] + terms1[j] - 2 * products[i, j]`. The first query of the block
     has the number `start`. `rows` and `values`, (Q, K), get the K nearest rows of the base for each
-    query (the lower row of a tie) and their squared distances. `nearest`, `best` and `second`, (M,),
-    are updated: the nearest query in all blocks so far for each row of the base, and the squared
-    distances of the two nearest queries.
+    query (the lower row of a tie) and their squared distances. `nearest`, `best` and `second`
+    are updated for each of the M rows of the base: the nearest query in all blocks so far, and the
+    squared distances of the two nearest queries.
     """
     count = products.shape[1]
     chunks = (count + CHUNK - 1) // CHUNK
@@ -399,8 +399,8 @@ ATAN = tuple(
 def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def]
     """Return the dominant gradient directions around (N, 2) pixels, (N,) float32 degrees.
 
-    Gradients vote for `BINS` directions, weighted by a Gaussian window around the pixel. `windows`,
-    (N,), holds the sigmas of these windows. The outermost pixels of the image do not vote.
+    Gradients vote for `BINS` directions, weighted by a Gaussian window around the pixel. `windows`
+    holds the sigmas of these windows. The outermost pixels of the image do not vote.
     """
     height, width = image.shape
     angles = np.zeros(len(pixels), np.float32)

@@ -69,7 +69,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
 
 
 def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw all keypoints, and a caption with their number; `fit_picture` scales large images down."""
+    """Draw all keypoints, and a caption that counts them; `fit_picture` may scale it down."""
     caption = f"{_counted(keypoints)}, {keypoints.density:.1%} of the pixels"
     return add_caption(fit_picture(keypoints.draw(rgb)), caption)
 

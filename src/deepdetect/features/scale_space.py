@@ -26,10 +26,10 @@ MIN_SIDE_PX = 8
 
 
 def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each keypoint, the octave and the layer (1 to 3) whose sigma is nearest to its own.
+    """Return for each keypoint the octave and the layer, 1 to 3, whose sigma is nearest to its own.
 
-    The (N,) sizes are twice the keypoints' sigmas, as in OpenCV's SIFT. `shape` is the (height, width) of the
-    image. Octave -1 is the image enlarged to twice its size.
+    The (N,) sizes are twice the keypoints' sigmas, as in OpenCV's SIFT. `shape` is the image's
+    (height, width). Octave -1 is the image enlarged to twice its size.
     """
     sigma = np.maximum(np.asarray(sizes, np.float64) / SIZE_PER_SIGMA, 1e-6)
     step = np.rint(LAYERS * np.log2(sigma / BASE_SIGMA_PX)).astype(np.int64)

@@ -46,7 +46,7 @@ class Maps:
 
     @classmethod
     def of_logits(cls, logits: np.ndarray) -> Maps:
-        """Return maps with these logits; rows of the heat map, their sigmoid, are computed on demand."""
+        """Return maps with these logits; rows of the heat map are computed from them on demand."""
         return cls(logits.shape, lambda: lambda rows: sigmoid(logits[rows]), lambda: logits)
 
     def both(self) -> tuple[np.ndarray, np.ndarray]:
