@@ -392,7 +392,7 @@ ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-"""Coefficients of OpenCV's arctangent, in degrees, so that votes go to the same bins as in OpenCV."""
+"""Coefficients of OpenCV's arctangent, in degrees: votes then go to the same bins as in OpenCV."""
 
 
 @compiled(nogil=True, error_model="numpy")

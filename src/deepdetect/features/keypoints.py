@@ -319,8 +319,8 @@ def unit_length(descriptors: np.ndarray) -> np.ndarray:
 def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Rank (N, 2) positions so that the first of them, however many, are spread evenly.
 
-    The ranks, (N,) float32 in [0, 1), come from ordered dithering: they are values of a Bayer matrix
-    that covers an image of this (width, height), each at the pixel nearest to the position.
+    The ranks, (N,) float32 in [0, 1), come from ordered dithering. They are values of a Bayer
+    matrix that covers an image of this (width, height), each at the pixel nearest to the position.
     Neighbouring pixels get very different ranks.
     """
     column, row = np.rint(np.asarray(xy).reshape(-1, 2)).astype(np.int64).T

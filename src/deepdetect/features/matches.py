@@ -16,7 +16,8 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""An end of a match belongs to the nearest keypoint if it is at most this far away. Chosen by hand."""
+"""An end of a match belongs to the nearest keypoint if that is at most this far away. Chosen by
+hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,
@@ -130,7 +131,7 @@ class GuidedMatches:
         return xy0[self.indices0] if self.points0 is None else self.points0
 
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
-        """Return these matches joined with those of `other` where `chosen`, a bool mask, is true."""
+        """Return these matches joined with those of `other` where the mask `chosen` is true."""
         order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")
 
         def both(name: str) -> np.ndarray:
@@ -307,7 +308,7 @@ class Matches:
         return [cv2.DMatch(i, j, d) for i, j, d in zip(*columns, strict=True) if min(i, j) >= 0]
 
     def unique(self) -> Matches:
-        """Return one-to-one matches: those with the highest score of all matches at both their ends.
+        """Return one-to-one matches: those with the highest score of all matches at both ends.
 
         An end is a keypoint or, without one, a pixel. Among equal scores the first match is kept.
 
@@ -384,7 +385,7 @@ class Matches:
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def _repr_html_(self) -> str:
-        """Return HTML for notebooks: a small table, and a figure with the positions of the matches."""
+        """Return HTML for notebooks: a small table, and a figure with some of the matches."""
         from .display import html_summary
 
         inliers, geometry = np.count_nonzero(self.inliers), self.geometry
