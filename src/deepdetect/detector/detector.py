@@ -27,8 +27,8 @@ from .heatmap import HeatmapOptions, compute_maps, memory_named
 from .pretrained import PRETRAINED, resolve_weights
 
 CHANNELS_OF_IMAGES = (
-    "give it with each image, as in detect(image, channels='bgr'); the order in the network's own "
-    "input is `network_channels`"
+    "give it with each image, as in detect(image, channels='bgr'); `network_channels` is the order "
+    "in the network's own input"
 )
 
 
@@ -45,7 +45,7 @@ class HeatmapDetector(Protocol):
     """Anything that computes heat maps, from which keypoints can be selected."""
 
     def heatmap(self, image: Any) -> np.ndarray:
-        """Return the probability, at each pixel of an image, of a keypoint: (H, W) float32."""
+        """Return the probabilities that the pixels of an image are keypoints, (H, W) float32."""
 
 
 AnyDetector = Detector | HeatmapDetector
@@ -253,7 +253,7 @@ class DeepDetect:
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.
-            OptionError: an option is out of its range, or the mask has another size.
+            OptionError: an option is out of its range, or the mask has another size than the image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
         return self._select(load_image(image, channels=channels), options, ignore)
@@ -318,7 +318,7 @@ class DeepDetect:
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.
-            OptionError: an option is out of its range, or the mask has another size.
+            OptionError: an option is out of its range, or the mask has another size than the image.
         """
         rgb = load_image(image, channels=channels)
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)

@@ -26,8 +26,8 @@ MAX_AUTO_PIXELS = 2_000_000
 mostly show blur and noise."""
 
 RELEASE_PIXELS = 20_000_000
-"""If a scaled-down image has more pixels than this, the memory that the network keeps is released
-before its maps are enlarged to the size of the image."""
+"""If an image with more pixels than this was scaled down for the network, the memory that the
+network keeps is released before its maps are enlarged."""
 
 MIN_TILE_MEGAPIXELS = 1.5
 """Minimum size of a tile: smaller tiles would consist mostly of overlap."""
@@ -169,7 +169,7 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
         return None
     raise OptionError(
         "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights of "
-        "the network fast, in float32"
+        "the network `fast`, in float32"
     )
 
 

@@ -44,9 +44,9 @@ class PointDetector:
 
     Args:
         max_keypoints: maximum number of keypoints per image. None: all.
-        spread: how `max_keypoints` are chosen from more. "none" takes those ranked highest. "grid"
-            takes the best of each cell of a grid, then the second-best of each, and so on. "anms"
-            takes good ones that lie as far apart as their number allows.
+        spread: how keypoints are chosen if there are more than `max_keypoints`. "none" takes those
+            ranked highest. "grid" takes the best of each cell of a grid, then the second-best of
+            each, and so on. "anms" takes good ones that lie as far apart as their number allows.
         resolution: "auto" (images over two megapixels are scaled down to that) or "native" (images
             keep their size).
         ranker: npz file of the network that ranks the keypoints, written by `deepdetect dev
@@ -258,7 +258,7 @@ class PointDetector:
         size = (gray.shape[1], gray.shape[0])
         scaled = size != (width, height)
         if scaled and ignore is not None:
-            # A scaled pixel is ignored if it, or one next to it, covers an ignored pixel.
+            # A pixel of the scaled image is ignored if it or a neighbour covers an ignored pixel.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
         with memory_named(gray.shape), limited_threads(self.threads):

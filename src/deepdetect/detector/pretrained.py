@@ -27,7 +27,7 @@ STRIDE = 8
 """The network halves an image three times, so the image's sides must be multiples of 8."""
 
 PADDED_IMAGE = "padded_image"
-"""In ONNX files that pad images to multiples of 8, this is the name of the padded image."""
+"""Name of the padded image, in ONNX files that pad the image to multiples of 8 themselves."""
 
 LOGITS = "logits"
 """Name of the ONNX output that holds logits; an output of another name holds probabilities."""
@@ -38,7 +38,7 @@ programs: this package does not read them."""
 
 
 def pretrained_weights(name: str = "default") -> Path:
-    """Return the path of bundled weights; for an unknown name an OptionError suggests another."""
+    """Return the path of bundled weights; an OptionError for an unknown name suggests another."""
     return (FOLDER / look_up("name or file of weights", name, PRETRAINED)).with_suffix(".onnx")
 
 

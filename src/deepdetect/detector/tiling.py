@@ -42,8 +42,8 @@ THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
 that `export_onnx` gives. All tensors have four dimensions."""
 
 SCALES = (4, 2, 1)
-"""For every 8 pixels (`STRIDE`) of the image's width and height, the three feature maps have this
-many columns and rows."""
+"""The three feature maps have this many columns for every 8 pixels (`STRIDE`) of the image's width,
+and as many rows for every 8 pixels of its height."""
 
 MARGIN = 4
 """Each tile is enlarged on all sides by this many strides of 8 pixels, because the convolutions

@@ -35,8 +35,8 @@ def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.n
     rgb = array_to_rgb(image, channels)
     if rgb.shape[1::-1] != size:
         raise ImageError(
-            f"the image has {rgb.shape[1]}x{rgb.shape[0]} pixels, but the keypoints are of "
-            f"one with {size[0]}x{size[1]}: give the image in which they were detected"
+            f"the image has {rgb.shape[1]}x{rgb.shape[0]} pixels, but the keypoints were "
+            f"detected in one of {size[0]}x{size[1]} pixels: give that image"
         )
     return rgb
 

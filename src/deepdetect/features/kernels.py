@@ -29,15 +29,16 @@ BINS = 36
 """Number of bins in the histogram of gradient directions around a keypoint, as in Lowe (2004)."""
 
 RADIUS_PER_WINDOW = 3.0
-"""Radius within which pixels vote for a direction, in sigmas of the window, as in OpenCV."""
+"""Radius within which pixels vote for the direction of a keypoint, in sigmas of the Gaussian window
+around it, as in OpenCV."""
 
 CHUNK = 64
 """The exact search keeps the minimum of each chunk of this many distances, so that it need not
 compare all distances again for every further neighbour."""
 
 MIN_SQUARED_NORMS = 1e-3
-"""Correlations are divided by the root of two squared norms, multiplied. The product is at least
-this, because a descriptor that equals the mean has norm 0."""
+"""A correlation is divided by the square root of the product of two squared norms. This is the
+minimum of the product, because a descriptor that equals the mean has norm 0."""
 
 
 @compiled(nogil=True, fastmath=True)
@@ -162,7 +163,7 @@ def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
 # Full fastmath would approximate division and root, and equal descriptors would not give 0.
 @compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
 def correlation_distances(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
-    """Write 1 - correlation about `mean` of the pairs `start` to `stop` (exclusive) into `out`."""
+    """Write 1 - correlation of the descriptor pairs `start` to `stop` (exclusive) into `out`."""
     for k in range(start, stop):
         a, b = first[rows0[k]], second[rows1[k]]
         both = np.float32(0)
@@ -324,7 +325,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
             nearer, farther = distances[query, 0], distances[query, 1]
             state = _hash(np.uint32(query) ^ _hash(np.uint32(seed + 7919 * (turn + 1))))
             for trial in range(spread + len(radii)):
-                if trial < spread:  # a shifted match of a query at an offset in x or y
+                if trial < spread:  # the match of a query at an offset in x or y, shifted by it
                     offset = offsets[trial // 4] * direction
                     right, down = (0, offset) if trial & 2 else (offset, 0)
                     x, y = xy0[query, 0] - right, xy0[query, 1] - down

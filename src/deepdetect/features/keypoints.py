@@ -15,8 +15,8 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""The diameter of a keypoint is this many times the "scale" that LightGlue gets, which means a
-diameter or a sigma."""
+"""Diameter of a keypoint divided by the "scale" that LightGlue gets, for both meanings of that
+scale."""
 
 MAX_COORDINATE_BITS = 12
 """`bayer_order` uses at most this many bits of x and of y, so that float32 holds the ranks
@@ -46,9 +46,9 @@ class Keypoints:
             `best` ranks by logits.
         image_size: (width, height) of the image in pixels.
         logits: (N,) float32 logits of the probabilities, or None.
-        sizes: (N,) float32 diameters in pixels, or None if all keypoints have the same size.
-        angles: (N,) float32 orientations in degrees (-1: unset), or None if all keypoints have the
-            same orientation.
+        sizes: (N,) float32 diameters in pixels, or None if keypoints have no size of their own.
+        angles: (N,) float32 orientations in degrees (-1: unset), or None if keypoints have no
+            orientation of their own.
         octaves: (N,) int32 octaves and layers of SIFT, packed as in OpenCV, or None.
         descriptors: (N, D) uint8 or float32, or None if keypoints are not described.
         descriptor_type: type of the descriptors, such as "rootsift"; None if it is unknown or there
@@ -84,7 +84,7 @@ class Keypoints:
         if xy.ndim != 2 or xy.shape[1] != 2 or scores.shape != xy.shape[:1]:
             raise OptionError(
                 f"keypoints need (N, 2) positions and (N,) scores, "
-                f"not {xy.shape} and {scores.shape}"
+                f"not arrays of shape {xy.shape} and {scores.shape}"
             )
         if not (np.isfinite(xy).all() and np.isfinite(scores).all()):
             raise OptionError("keypoints need finite positions and scores")
@@ -94,7 +94,8 @@ class Keypoints:
                 fields[name] = values = numbers_of(name, getattr(self, name), dtype)
                 if values.shape != scores.shape:
                     raise OptionError(
-                        f"{len(scores)} keypoints need (N,) {name}, not {values.shape}"
+                        f"{len(scores)} keypoints need (N,) {name}, not an array of shape "
+                        f"{values.shape}"
                     )
                 if name != "logits" and not np.isfinite(values).all():
                     raise OptionError(f"keypoints need finite {name}")
@@ -104,7 +105,8 @@ class Keypoints:
             descriptors = numbers_of("descriptors", self.descriptors, kind)
             if descriptors.ndim != 2 or len(descriptors) != len(scores):
                 raise OptionError(
-                    f"{len(scores)} keypoints need (N, D) descriptors, not {descriptors.shape}"
+                    f"{len(scores)} keypoints need (N, D) descriptors, not an array of shape "
+                    f"{descriptors.shape}"
                 )
             if not whole and not np.isfinite(descriptors).all():
                 raise OptionError("keypoints need finite descriptors")

@@ -27,7 +27,7 @@ often."""
 LENGTH = 64
 
 CONSTANT = 16
-"""The first 16 numbers of a descriptor do not change if the image is rotated."""
+"""The first 16 numbers of a learned descriptor do not change if the image is rotated."""
 
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
 """The remaining 48 numbers of a descriptor are first the real and then the imaginary parts of 24
@@ -35,12 +35,12 @@ complex numbers. If the image is rotated, the phase of each complex number grows
 rotation times its factor in this array."""
 
 UPRIGHT_DEGREES = 15.0
-"""Below this angle, two images count as equally oriented: the networks have learned to tolerate
-such rotations."""
+"""A rotation between two images by less than this angle is ignored, because the networks have
+learned to tolerate it."""
 
 TURNED_KEYPOINTS = 512
-"""The rotation between two images is estimated from the best keypoints of each image, this many.
-Chosen by hand."""
+"""This many keypoints of each image, the best ones, are matched to estimate the rotation between
+the images. Chosen by hand."""
 
 HISTOGRAM_DEGREES = 10
 NEAR_DEGREES = 20
@@ -56,8 +56,9 @@ def is_learned(descriptor_type: str | None) -> bool:
 def angles_counted(descriptor_type: str) -> int:
     """Return the factor by which keypoint angles are multiplied before descriptors are rotated.
 
-    It is 1, but 2 for cross-modal descriptors. In the image of another sensor, a gradient may point
-    the opposite way, and opposite directions are equal after their angles are doubled.
+    It is 2 for cross-modal descriptors, and 1 for others. In the image of another sensor, a
+    gradient may point the opposite way, and opposite directions are equal after their angles are
+    doubled.
     """
     return 2 if descriptor_type.startswith(CROSS_MODAL) else 1
 

@@ -62,7 +62,8 @@ def require_suited(*features: Keypoints) -> None:
     if not all(map(suits_filter, features)):
         raise OptionError(
             "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "
-            "descriptors or RootSIFT, as `PointDetector.extract` returns them: use 'ratio' instead"
+            "descriptors or RootSIFT, as `PointDetector.extract` returns them: use "
+            "`filter_by='ratio'`"
         )
 
 

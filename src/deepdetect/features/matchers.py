@@ -26,8 +26,8 @@ BLOCK_SIZE = 2_000_000
 fits in most caches."""
 
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
-"""For uint8 descriptors with at most this many numbers, squared distances are exact in single
-precision."""
+"""Maximum length of uint8 descriptors whose squared distances are exact in single precision, which
+needs sums below 2^24."""
 
 PRODUCTS = Path(__file__).with_name("products")
 """Folder of ONNX files with one matrix product each, made by `tools/product_graphs.py`. NumPy's
@@ -47,7 +47,7 @@ SWEEPS = 4
 hand."""
 
 OFFSETS_PX = (1, 4, 12)
-"""For each query, PatchMatch tries the shifted matches of other queries at these distances in x or
+"""PatchMatch tries, for each query, the shifted matches of other queries at these distances in x or
 in y. The smallest is 1 because dense keypoints are 1 px apart."""
 
 BAND_HEIGHT_PX = 96
@@ -138,7 +138,7 @@ def _search_both_ways(
 
 
 def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.ndarray:
-    """Return the rows of the nearest neighbours of few queries, in double precision."""
+    """Return the rows of the nearest neighbours of a few queries, in double precision."""
     rows = np.empty((len(queries), count), np.int32)
     squares = np.einsum("ij,ij->i", base, base, dtype=np.float64)
     step = max(1, BLOCK_SIZE // (2 * len(base)))

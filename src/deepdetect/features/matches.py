@@ -127,7 +127,7 @@ class GuidedMatches:
         return len(self.indices0)
 
     def starts(self, xy0: np.ndarray) -> np.ndarray:
-        """Return the (M, 2) positions in the first image, whose keypoints lie at `xy0`."""
+        """Return the (M, 2) positions in the first image; its keypoints lie at `xy0`."""
         return xy0[self.indices0] if self.points0 is None else self.points0
 
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
@@ -353,7 +353,7 @@ class Matches:
         lines: int = 150,
         by_position: bool = False,
     ) -> np.ndarray:
-        """Draw matches on both images side by side: lines, green for inliers and red for outliers.
+        """Draw matches as lines on both images side by side: inliers in green, outliers in red.
 
         Args:
             image0, image1: arrays, PyTorch tensors or PIL images.

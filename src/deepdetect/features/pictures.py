@@ -21,8 +21,8 @@ from .selection import spread_over_grid
 
 SHOWN_KEYPOINTS = 1000
 AREA_OF_KEYPOINT_PX = 200
-"""At most `SHOWN_KEYPOINTS` are drawn. Small images get at most one keypoint per
-`AREA_OF_KEYPOINT_PX` square pixels, so that all can be told apart. Chosen by hand."""
+"""`SHOWN_KEYPOINTS` is the maximum number of keypoints that are drawn. Small images get at most one
+keypoint per `AREA_OF_KEYPOINT_PX` square pixels, so that all can be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
 """Keypoints use the colour scale, from 0 to 1, only from this level up, because darker colours are
@@ -61,7 +61,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     if keypoints.sizes is not None:
         radii = np.maximum(keypoints.sizes[rows] * factor / 2, 2 * unit)
     centres = scaled_points(keypoints.xy[rows], factor)
-    # The best keypoints are drawn last, on top. A dark rim makes circles visible anywhere.
+    # The best keypoints come last, on top. A dark rim makes circles visible on any background.
     for k in np.argsort(values[rows]):
         draw_circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
         draw_circle(canvas, centres[k], radii[k], colors[k], max(1, round(1.25 * unit)))
@@ -69,7 +69,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
 
 
 def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw all keypoints, and a caption that counts them; `fit_picture` may scale it down."""
+    """Draw all keypoints, scale the picture down if large, and add a caption with their number."""
     caption = f"{_counted(keypoints)}, {keypoints.density:.1%} of the pixels"
     return add_caption(fit_picture(keypoints.draw(rgb)), caption)
 

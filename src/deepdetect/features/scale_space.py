@@ -40,7 +40,7 @@ def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarra
 
 
 def packed_octaves(sizes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the octave and layer for SIFT of keypoints with (N,) sizes, packed as in OpenCV."""
+    """Return octave and layer of keypoints with (N,) sizes, packed into (N,) int64 as in OpenCV."""
     octaves, layers = nearest_layers(sizes, shape)
     return (octaves & 255) | (layers << 8)
 
@@ -75,8 +75,8 @@ def gaussian_layers(
 
 
 WINDOW_PER_SIGMA = 1.5
-"""For the orientation, gradients are weighted by a Gaussian window. Its sigma is this many times
-that of the keypoint, as in Lowe (2004)."""
+"""The gradients that vote for the orientation are weighted by a Gaussian window. Its sigma is this
+many times that of the keypoint, as in Lowe (2004)."""
 
 
 def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:

@@ -28,7 +28,8 @@ keypoint of each cell before the second-best of any, so that keypoints cover the
 hand."""
 
 DISTANCE_STEP_PX = 0.25
-"""`spread_by_distance` finds the largest possible distance to this precision. Chosen by hand."""
+"""Precision with which `spread_by_distance` finds the largest distance that leaves enough
+keypoints. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,8 @@ DENSE_SIZES_PX = (2.0, 8.0)
 """Range of keypoint diameters, in pixels, that `dense_sift` supports."""
 
 MIN_DENSE_DENSITY = 0.02
-"""With more keypoints per pixel than this, `dense_sift` is faster than describing one keypoint at a
-time."""
+"""If there are more keypoints per pixel than this, `dense_sift` is faster than describing one
+keypoint at a time."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
@@ -41,7 +41,7 @@ MIN_KEYPOINTS = 1000
 hand."""
 
 ROWS_AT_ONCE = 1024
-"""This many descriptors are converted at a time: they stay in the processor's cache."""
+"""This many descriptors are converted to RootSIFT at a time: they stay in the processor's cache."""
 
 
 def sift_descriptors(

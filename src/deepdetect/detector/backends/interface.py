@@ -22,7 +22,7 @@ class Network(Protocol):
     """A loaded network."""
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Map (N, 3, H, W) float32 in [0, 1] to (N, 1, H, W) float32 logits, all finite.
+        """Map images, (N, 3, H, W) float32 in [0, 1], to finite logits, (N, 1, H, W) float32.
 
         H and W are multiples of 8. Lack of memory raises a MemoryError, and an output of a wrong
         shape or type a WeightsError.

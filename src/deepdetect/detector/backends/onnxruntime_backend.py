@@ -42,7 +42,7 @@ class OnnxRuntimeNetwork:
         return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
     def release_memory(self) -> None:
-        """Release the memory that is kept between runs."""
+        """Release the memory that the session keeps between runs."""
         settings = import_onnxruntime().RunOptions()
         settings.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         smallest = np.zeros((1, 3, *PROBE_SHAPE), np.float32)
@@ -60,7 +60,7 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
     if provider not in known:
         raise unknown_name("device", device, (*PROVIDERS, *known))
     if provider not in available:
-        build = "onnxruntime-gpu in its place" if device == "cuda" else "the build that has it"
+        build = "onnxruntime-gpu in its place" if device == "cuda" else "a build with this device"
         raise OptionError(
             f"the installed onnxruntime does not have the device {device}: install {build}, or use "
             f"{' or '.join(['cpu', *(name for name in available if name != CPU)])}"

@@ -39,7 +39,7 @@ class OpenVinoNetwork:
         self._model = compile_model()
         self._output_name = output_to_read([v.get_any_name() for v in self._model.outputs])
         self._path = path
-        # Tiles are only computed in float32.
+        # Only float32 networks run in tiles, which are made from the file at `onnx_path`.
         self.onnx_path = path if options.precision == "float32" else None
         self.threads = options.threads
         self._works = False  # whether a run has given a correct result
@@ -49,7 +49,7 @@ class OpenVinoNetwork:
             model = self._model
             if model is None:
                 model = self._model = self._compile()
-            request = model.create_infer_request()  # several threads may run the model at once
+            request = model.create_infer_request()  # one per call, as threads may run at once
             output = request.infer([image], share_inputs=True)[self._output_name]
         except Exception as error:  # OpenVINO's exceptions share no base class
             self._model = None
@@ -63,7 +63,7 @@ class OpenVinoNetwork:
         return logits
 
     def release_memory(self) -> None:
-        """Release the memory that is kept between runs."""
+        """Release the memory that the model keeps between runs."""
         # The method fails while another thread runs the model. Versions before 2025 lack it.
         with contextlib.suppress(Exception):
             self._model.release_memory()
@@ -108,9 +108,9 @@ def _keep_what_is_read(graph: Any) -> None:
     unread = names - {LOGITS} if LOGITS in names else set(POINTS)
     for result in graph.get_results():
         own = result.output(0).get_names()
-        if own & unread and LOGITS not in own:  # versions before 2025 may name one output twice
+        if own & unread and LOGITS not in own:  # before 2025, one output may have two names
             graph.remove_result(result)
     for node in graph.get_ordered_ops():
         for value in node.outputs():
             if PADDED_IMAGE in value.get_names():
-                value.replace(graph.input(0))  # a padded copy would take 12 bytes per pixel
+                value.replace(graph.input(0))  # saves a copy of 12 bytes per pixel

@@ -1,7 +1,7 @@
 """The registry of the backends that can run the network.
 
 To add a backend, write a module in this folder with a function `open_NAME(path, options) ->
-Network`, and add its line here.
+Network`, and add the function to `BACKENDS`.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ BACKENDS: dict[str, Callable[[Path, RuntimeOptions], Network]] = {
     "onnxruntime": open_onnxruntime,
     "openvino": open_openvino,
 }
-"""For each backend, the function that opens a file. The name of a backend is also that of the
-Python package that it needs."""
+"""The functions with which the backends open a file, by the name of the backend, which is also that
+of the Python package that it needs."""
 
 PRECISIONS = ("float32", "bfloat16")
 
@@ -68,7 +68,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 
 @functools.lru_cache(maxsize=4)
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
-    """Load and check a file. `state` makes the cache load a changed file again."""
+    """Load and check a file, and cache the network; a file with a new `state` is loaded again."""
     network = BACKENDS[backend](path, options)
     _check_answer(network, path)
     return network

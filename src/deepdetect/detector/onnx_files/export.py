@@ -1,7 +1,7 @@
 """Export of ONNX files for other programs, for any image size or a fixed one.
 
 The input of a file is `image`. Its outputs are the network's maps, `probability` and `logits`, and
-the keypoints that `add_points` adds; either may be left out.
+the keypoints that `add_points` adds. Either the maps or the keypoints may be left out.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
 
     try:
         model = onnx.load_model_from_string(path.read_bytes())
-    except Exception as error:  # protobuf's errors, passed on by onnx
+    except Exception as error:  # onnx passes on the errors of Protobuf
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({error}): download it again"
         ) from None

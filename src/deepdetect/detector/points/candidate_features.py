@@ -21,8 +21,8 @@ RING_POINTS = 8
 
 FEATURES = 23 + 8 * len(RING_RADII)
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
-"""These are added to |det Hessian|, to squared gradients, and to the strengths by which features
-are divided, so that noise and rounding have little effect on logarithms and quotients."""
+"""The three floors are added to |det Hessian|, to squared gradients, and to the strengths by which
+features are divided, so that noise and rounding have little effect on logarithms and quotients."""
 
 
 def ring_offsets() -> np.ndarray:

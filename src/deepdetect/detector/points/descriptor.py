@@ -1,4 +1,4 @@
-"""The learned descriptor: a network sees the whole image, and is sampled at the keypoints."""
+"""The learned descriptor: a network runs on an image, and its features are sampled at keypoints."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def detect_points(
     The logits are the outputs of the ranker. The scores are made from them: they lie in (0, 1), all
     differ, and have the same order.
     """
-    # Spread keypoints also lie in regions of low contrast, which lack strong candidates.
+    # Spreading needs all candidates: the strongest ones do not lie in regions of low contrast.
     limit = max_keypoints if spread == "none" else None
     strongest = None if limit is None else max(CANDIDATES_PER_KEYPOINT * limit, MIN_CANDIDATES)
     candidates, logits = rank_candidates(gray, strongest, ignore=ignore, ranker=ranker)
@@ -108,7 +108,7 @@ def rank_candidates(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
     rows = rows[:strongest]
-    # The order by tiles lets candidates of all scales share the pixels in the processor's cache.
+    # In the order of tiles, candidates of all scales use the same pixels in the cache.
     tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
     candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
     return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))

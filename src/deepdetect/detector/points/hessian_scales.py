@@ -87,8 +87,8 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
 def find_candidates(space: ScaleSpace) -> Candidates:
     """Find the maxima of |det Hessian| in each level except the finest and the two coarsest.
 
-    Positions are refined by parabolas in x and y. No maxima are searched in the
-    outermost rows and columns.
+    Positions are refined by parabolas in x and y. No maxima are searched in the outermost
+    rows and columns.
     """
     pixels, positions, strengths = [], [], []
     window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)

@@ -74,5 +74,7 @@ def load_ranker(path: Path = RANKER) -> Ranker:
         and all(np.isfinite(each).all() for each in (mean, deviation, *itertools.chain(*layers)))
     )
     if not fits:
-        raise WeightsError(f"{path} holds another network than the ranker: use other weights")
+        raise WeightsError(
+            f"{path} holds weights of a network other than the ranker: use other weights"
+        )
     return Ranker(mean, deviation, layers, notes)
