@@ -35,8 +35,8 @@ complex numbers. If the image is rotated, the phase of each complex number grows
 rotation times its factor in this array."""
 
 UPRIGHT_DEGREES = 15.0
-"""A rotation between two images by less than this angle is ignored, because the networks have
-learned to tolerate it."""
+"""A rotation between two images by less than this angle need not be undone, because the networks
+have learned to tolerate it."""
 
 TURNED_KEYPOINTS = 512
 """This many keypoints of each image, the best ones, are matched to estimate the rotation between

@@ -39,7 +39,7 @@ class OpenVinoNetwork:
         self._model = compile_model()
         self._output_name = output_to_read([v.get_any_name() for v in self._model.outputs])
         self._path = path
-        # Only float32 networks run in tiles, which are made from the file at `onnx_path`.
+        # A network runs in tiles only in float32. Its parts are then read from `onnx_path`.
         self.onnx_path = path if options.precision == "float32" else None
         self.threads = options.threads
         self._works = False  # whether a run has given a correct result
@@ -108,7 +108,7 @@ def _keep_what_is_read(graph: Any) -> None:
     unread = names - {LOGITS} if LOGITS in names else set(POINTS)
     for result in graph.get_results():
         own = result.output(0).get_names()
-        if own & unread and LOGITS not in own:  # before 2025, one output may have two names
+        if own & unread and LOGITS not in own:  # before version 2025, an output may have two names
             graph.remove_result(result)
     for node in graph.get_ordered_ops():
         for value in node.outputs():
