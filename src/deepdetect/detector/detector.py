@@ -64,8 +64,7 @@ class DeepDetect:
         resolution: "auto" (images over two megapixels are scaled down to that), "native" (images
             keep their size), or a number of pixels: images of any shape are resized to a square of
             that side. The paper uses 480.
-        backend: "auto" (ONNX Runtime for float32, OpenVINO for bfloat16), "onnxruntime" or
-            "openvino".
+        backend: "auto" (OpenVINO for bfloat16, else ONNX Runtime), "onnxruntime" or "openvino".
         device: "cpu", "cuda", or the name of any execution provider of ONNX Runtime.
         threads: number of threads. None: the backend's choice.
         precision: number format of the network, "float32" or "bfloat16". The latter is faster, but
@@ -75,8 +74,7 @@ class DeepDetect:
             paper's published code. For images read by OpenCV keep "rgb", and call the methods with
             `channels="bgr"`.
         tta: "none", or "flip", which averages the logits over eight flips and quarter turns of the
-            image. It takes eight times as long, but a flipped or turned image gets the same
-            keypoints.
+            image: flipped or turned images get the same keypoints, in eight times the time.
         tile_megapixels: size, in megapixels, of the tiles into which larger images are divided if
             the resolution is "native". Tiles take less memory and about twice the time. "auto": an
             image is divided only if memory is short. The weights "espnet" cannot run in tiles, only
@@ -274,8 +272,7 @@ class DeepDetect:
         """Detect the dense keypoints of several images.
 
         Args:
-            images: a list or a tuple, whose images may differ in size, or an array of four
-                dimensions.
+            images: a list or tuple of images of any sizes, or an array of four dimensions.
             threshold, density, max_keypoints, nms_radius, subpixel, channels: see `detect`.
             ignore: one mask for all images, or a list or tuple with a mask or None for each image.
 

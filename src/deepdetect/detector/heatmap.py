@@ -49,8 +49,7 @@ class HeatmapOptions:
         network_channels: order of the colours in the network's input: "rgb", or "bgr" as in the
             paper's published code, although the weights were trained on RGB. The order in the
             images that you give is another option, `channels`.
-        tta: "none", or "flip": the mean of the logits over eight flips and quarter turns of the
-            image.
+        tta: "none", or "flip": the mean logits of eight flips and quarter turns of the image.
         tile_megapixels: size of the tiles into which larger images are divided, 1.5 or more.
             "auto": 2.7, and only if the image is too large for the free memory. Only ONNX weights
             of the network `fast` can run in tiles.

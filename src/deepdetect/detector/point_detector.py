@@ -169,8 +169,7 @@ class PointDetector:
         """Detect the best keypoints of several images.
 
         Args:
-            images: a list or a tuple, whose images may differ in size, or an array of four
-                dimensions.
+            images: a list or tuple of images of any sizes, or an array of four dimensions.
             ignore: one mask for all images, or a list or tuple with a mask or None for each image.
             max_keypoints, channels: see `detect`.
 

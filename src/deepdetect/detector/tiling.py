@@ -50,8 +50,7 @@ MARGIN = 4
 depend on pixels up to 28 px away."""
 
 BYTES_PER_PIXEL = 90
-"""Approximate memory of a run without tiles, in bytes per pixel of the image, for ONNX Runtime and
-for OpenVINO."""
+"""Approximate memory, in bytes per pixel, of a run without tiles in ONNX Runtime or OpenVINO."""
 
 DEFAULT_TILE_MEGAPIXELS = 2.7
 

@@ -23,10 +23,7 @@ Points = tuple[np.ndarray, tuple[int, int]]
 
 
 def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.ndarray:
-    """Convert an array, a tensor or a PIL image to (H, W, 3) uint8 RGB.
-
-    A path, or an image whose (width, height) is not `size`, raises an ImageError.
-    """
+    """Convert an array, tensor or PIL image of this (width, height) to (H, W, 3) uint8 RGB."""
     if isinstance(image, (str, bytes)) or hasattr(image, "__fspath__"):
         raise ImageError("drawing needs the image itself, not a path: give load_image(path)")
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image

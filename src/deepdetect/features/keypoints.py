@@ -15,12 +15,10 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Diameter of a keypoint divided by the "scale" that LightGlue gets, for both meanings of that
-scale."""
+"""Diameter of a keypoint divided by the "scale" for LightGlue, for both meanings of the scale."""
 
 MAX_COORDINATE_BITS = 12
-"""`bayer_order` uses at most this many bits of x and of y, so that float32 holds the ranks
-exactly."""
+"""`bayer_order` uses this many bits of x and of y at most, so that float32 holds ranks exactly."""
 
 UNSET_ANGLE = -1
 """OpenCV gives this angle to keypoints without an orientation."""
@@ -46,13 +44,11 @@ class Keypoints:
             `best` ranks by logits.
         image_size: (width, height) of the image in pixels.
         logits: (N,) float32 logits of the probabilities, or None.
-        sizes: (N,) float32 diameters in pixels, or None if keypoints have no size of their own.
-        angles: (N,) float32 orientations in degrees (-1: unset), or None if keypoints have no
-            orientation of their own.
+        sizes: (N,) float32 diameters in pixels, or None if unknown.
+        angles: (N,) float32 orientations in degrees (-1: unset), or None if unknown.
         octaves: (N,) int32 octaves and layers of SIFT, packed as in OpenCV, or None.
         descriptors: (N, D) uint8 or float32, or None if keypoints are not described.
-        descriptor_type: type of the descriptors, such as "rootsift"; None if it is unknown or there
-            are no descriptors.
+        descriptor_type: type of the descriptors, such as "rootsift", or None if unknown.
 
     `len`, iteration over (x, y) rows and indexing by slices, masks and index arrays work.
 
@@ -84,7 +80,7 @@ class Keypoints:
         if xy.ndim != 2 or xy.shape[1] != 2 or scores.shape != xy.shape[:1]:
             raise OptionError(
                 f"keypoints need (N, 2) positions and (N,) scores, "
-                f"not arrays of shape {xy.shape} and {scores.shape}"
+                f"not {xy.shape} and {scores.shape}"
             )
         if not (np.isfinite(xy).all() and np.isfinite(scores).all()):
             raise OptionError("keypoints need finite positions and scores")
@@ -94,8 +90,7 @@ class Keypoints:
                 fields[name] = values = numbers_of(name, getattr(self, name), dtype)
                 if values.shape != scores.shape:
                     raise OptionError(
-                        f"{len(scores)} keypoints need (N,) {name}, not an array of shape "
-                        f"{values.shape}"
+                        f"{len(scores)} keypoints need (N,) {name}, not {values.shape}"
                     )
                 if name != "logits" and not np.isfinite(values).all():
                     raise OptionError(f"keypoints need finite {name}")
@@ -105,8 +100,7 @@ class Keypoints:
             descriptors = numbers_of("descriptors", self.descriptors, kind)
             if descriptors.ndim != 2 or len(descriptors) != len(scores):
                 raise OptionError(
-                    f"{len(scores)} keypoints need (N, D) descriptors, not an array of shape "
-                    f"{descriptors.shape}"
+                    f"{len(scores)} keypoints need (N, D) descriptors, not {descriptors.shape}"
                 )
             if not whole and not np.isfinite(descriptors).all():
                 raise OptionError("keypoints need finite descriptors")
@@ -268,8 +262,7 @@ class Keypoints:
     def distinct(self) -> Keypoints:
         """Keep only the best keypoint at each position: SIFT repeats a position for each angle."""
         order = np.argsort(-self.scores, kind="stable")
-        # Comparing x and y as one 64-bit number is ten times faster than comparing rows. Adding 0
-        # turns -0 into 0.
+        # Comparing x and y as one number is ten times faster than rows; + 0 turns -0 into 0.
         keys = np.ascontiguousarray(self.xy[order] + np.float32(0)).view(np.uint64).ravel()
         _, first = np.unique(keys, return_index=True)
         return self if len(first) == len(self) else self[np.sort(order[first])]

@@ -21,8 +21,7 @@ of the SHA-256 of their file."""
 RATIO, LEARNED_RATIO = 0.85, 0.88
 """Thresholds of Lowe's ratio test: `LEARNED_RATIO` for learned descriptors, `RATIO` for all others.
 On photos/val, learned descriptors at 0.88 are as precise as RootSIFT at 0.85, and match unrelated
-photographs no more often. At 0.93, learned descriptors match unrelated photographs four times as
-often."""
+photographs no more often. At 0.93 they match unrelated photographs four times as often."""
 
 LENGTH = 64
 
@@ -35,8 +34,7 @@ complex numbers. If the image is rotated, the phase of each complex number grows
 rotation times its factor in this array."""
 
 UPRIGHT_DEGREES = 15.0
-"""A rotation between two images by less than this angle need not be undone, because the networks
-have learned to tolerate it."""
+"""Smaller rotations between images need not be undone: the networks have learned to bear them."""
 
 TURNED_KEYPOINTS = 512
 """This many keypoints of each image, the best ones, are matched to estimate the rotation between
@@ -57,8 +55,7 @@ def angles_counted(descriptor_type: str) -> int:
     """Return the factor by which keypoint angles are multiplied before descriptors are rotated.
 
     It is 2 for cross-modal descriptors, and 1 for others. In the image of another sensor, a
-    gradient may point the opposite way, and opposite directions are equal after their angles are
-    doubled.
+    gradient may point the opposite way. Doubling makes the angles of opposite directions equal.
     """
     return 2 if descriptor_type.startswith(CROSS_MODAL) else 1
 

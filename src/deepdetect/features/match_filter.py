@@ -30,8 +30,7 @@ AROUND = 8
 network needs exactly this number."""
 
 MOST_DISTINCT = 512
-"""The rotation between the images is estimated from this many matches, those with the lowest
-ratios. Chosen by hand."""
+"""This many matches, with the lowest ratios, give the rotation between images. Chosen by hand."""
 
 FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
 """FLANN's codes for a kd-tree for few dimensions, and for an exact search."""
@@ -62,8 +61,7 @@ def require_suited(*features: Keypoints) -> None:
     if not all(map(suits_filter, features)):
         raise OptionError(
             "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "
-            "descriptors or RootSIFT, as `PointDetector.extract` returns them: use "
-            "`filter_by='ratio'`"
+            "descriptors or RootSIFT, as `PointDetector.extract` returns them: use 'ratio'"
         )
 
 

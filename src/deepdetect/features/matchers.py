@@ -22,12 +22,10 @@ from .._shared.runtimes import start_session
 from .keypoints import on_pixels
 
 BLOCK_SIZE = 2_000_000
-"""Exact search computes blocks of this many float32 distances at a time. A block takes 8 MB, which
-fits in most caches."""
+"""Exact search computes this many float32 distances at a time: 8 MB, which fit in most caches."""
 
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
-"""Maximum length of uint8 descriptors whose squared distances are exact in single precision, which
-needs sums below 2^24."""
+"""Maximum length of uint8 descriptors whose squared distances are exact in single precision."""
 
 PRODUCTS = Path(__file__).with_name("products")
 """Folder of ONNX files with one matrix product each, made by `tools/product_graphs.py`. NumPy's
@@ -43,8 +41,7 @@ FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
 as in the paper's code."""
 
 SWEEPS = 4
-"""PatchMatch makes this many sweeps over all queries, alternately down and up the image. Chosen by
-hand."""
+"""Number of PatchMatch's sweeps over all queries, down and up the image in turn. Chosen by hand."""
 
 OFFSETS_PX = (1, 4, 12)
 """PatchMatch tries, for each query, the shifted matches of other queries at these distances in x or
@@ -227,8 +224,7 @@ def patchmatch_neighbours(
     """
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(
-            "the matcher 'patchmatch' needs dense keypoints of one scale and angle, on whole "
-            "pixels: use 'auto'"
+            "'patchmatch' needs dense keypoints of one scale and angle, on whole pixels: use 'auto'"
         )
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
         raise OptionError(
@@ -276,8 +272,7 @@ def automatic_neighbours(
 ) -> Neighbours:
     """Find neighbours exactly if keypoints are few, otherwise by PatchMatch or FLANN.
 
-    PatchMatch needs uint8 descriptors and keypoints on whole pixels, of one scale and angle. FLANN
-    is used for all others.
+    PatchMatch needs uint8 descriptors and keypoints on whole pixels, of one scale and angle.
     """
     if len(queries) * len(base) <= MAX_EXACT_PRODUCT:
         return exact_neighbours(queries, base, count, seed, positions)

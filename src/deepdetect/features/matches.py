@@ -16,8 +16,7 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""An end of a match belongs to the nearest keypoint if that is at most this far away. Chosen by
-hand."""
+"""The end of a match belongs to the nearest keypoint up to this far away. Chosen by hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,
@@ -106,8 +105,7 @@ class GuidedMatches:
         points1: (M, 2) float64 positions in the second image.
         scores: (M,) float32 in [0, 1], higher is better.
         subpixel: whether `points1` are sub-pixel positions, as from a rectified pair.
-        indices1: (M,) int64 rows of the keypoints of the second image; None if `points1` are not
-            keypoints.
+        indices1: (M,) int64 rows of the keypoints at `points1`; None if these are no keypoints.
         points0: (M, 2) float64 positions in the first image, if they are not keypoints; otherwise
             None. With `points0`, a match without a keypoint near it has -1 in `indices0`.
         alike: (M,) bool, False if the images contradict a match: the window around it in the first
@@ -294,8 +292,7 @@ class Matches:
     def to_opencv(self) -> list[cv2.DMatch]:
         """Convert to OpenCV's matches of `keypoints0.to_opencv()` and `keypoints1.to_opencv()`.
 
-        The distance of a match is 1 - its score. Matches with an end that is no keypoint are left
-        out.
+        The distance of a match is 1 - its score. Matches without a keypoint at an end are left out.
 
         Example:
             >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))

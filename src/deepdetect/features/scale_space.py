@@ -9,8 +9,7 @@ import numpy as np
 from .._shared.opencv import cv2
 
 LAYERS = 3
-"""Number of layers per octave that hold keypoints, as in Lowe (2004). From layer to layer, sigma
-grows by the cube root of 2."""
+"""Layers with keypoints per octave, as in Lowe (2004): each has 2^(1/3) times the sigma before."""
 
 BASE_SIGMA_PX = 1.6
 """Sigma of the blur of the first image of an octave, in the octave's pixels, as in Lowe (2004)."""

@@ -23,13 +23,11 @@ BAND_PIXELS = 4_000_000
 """Maps are processed in bands of rows with about this many pixels, to limit the memory."""
 
 GRID_CELLS = 24
-"""Number of grid cells along the longer side of the image for `spread_over_grid`. It takes the best
-keypoint of each cell before the second-best of any, so that keypoints cover the image. Chosen by
-hand."""
+"""Number of grid cells along the longer side of the image. `spread_over_grid` takes the best
+keypoint of each cell before any second-best, so that keypoints cover the image. Chosen by hand."""
 
 DISTANCE_STEP_PX = 0.25
-"""Precision with which `spread_by_distance` finds the largest distance that leaves enough
-keypoints. Chosen by hand."""
+"""Precision with which `spread_by_distance` finds the largest distance. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +88,7 @@ class SelectionOptions:
         max_keypoints: maximum number of keypoints; the most probable ones are kept.
         nms_radius: radius of non-maximum suppression in pixels: a pixel is kept if it ranks highest
             within this distance in x and y; 0 keeps all.
-        subpixel: refine x and y to the maxima of two parabolas, each through three pixels along its
-            axis.
+        subpixel: refine x and y to the maxima of parabolas through three pixels along each axis.
 
     Raises:
         OptionError: a value is out of its range.
@@ -392,8 +389,7 @@ def spread_over_grid(
 def descending_order(values: np.ndarray) -> np.ndarray:
     """Return the indices that sort (N,) numbers from the highest to the lowest.
 
-    Among equal numbers, the lower index comes first. For float32 this is several times as fast as
-    NumPy's `argsort`.
+    Among equal numbers, the lower index comes first. For float32 this is faster than NumPy.
     """
     if values.dtype != np.float32:
         return np.argsort(-values, kind="stable")

@@ -1,7 +1,6 @@
 """SIFT descriptors of any keypoints (paper, Section III-C), and well-spread SIFT keypoints.
 
-To add a descriptor, add a function `(gray, xy, size, angle) -> (N, D) uint8 or float32` to
-`DESCRIPTORS`.
+To add a descriptor, add to `DESCRIPTORS` a function `(gray, xy, size, angle) -> (N, D) array`.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ DENSE_SIZES_PX = (2.0, 8.0)
 """Range of keypoint diameters, in pixels, that `dense_sift` supports."""
 
 MIN_DENSE_DENSITY = 0.02
-"""If there are more keypoints per pixel than this, `dense_sift` is faster than describing one
-keypoint at a time."""
+"""`dense_sift` is faster than describing one keypoint at a time if there are more keypoints per
+pixel than this."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
@@ -37,8 +36,7 @@ CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
 0.04. The thresholds apply to the contrast times the number of layers, as in OpenCV."""
 
 MIN_KEYPOINTS = 1000
-"""If a contrast threshold gives fewer keypoints than this, the next lower one is tried. Chosen by
-hand."""
+"""If there are fewer keypoints, the next lower contrast threshold is tried. Chosen by hand."""
 
 ROWS_AT_ONCE = 1024
 """This many descriptors are converted to RootSIFT at a time: they stay in the processor's cache."""
@@ -209,8 +207,7 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
 def describe_scaled(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
     """Return keypoints with SIFT descriptors at their own sizes and angles.
 
-    Unset angles are replaced by the dominant gradient orientations. A size that is not above 0
-    raises an OptionError.
+    Unset angles become the dominant gradient orientations. Sizes not above 0 raise an OptionError.
     """
     xy, sizes = keypoints.xy, keypoints.sizes
     assert sizes is not None

@@ -14,8 +14,7 @@ from ..._shared.options import suggest_keywords
 from ..pretrained import LOGITS
 
 PROBE_SHAPE = (24, 32)
-"""Height and width, in pixels, of the noise image on which a network is tested when it is loaded.
-Chosen by hand."""
+"""Height and width in pixels of the noise image that tests a loaded network. Chosen by hand."""
 
 
 class Network(Protocol):
@@ -50,8 +49,7 @@ def as_logits(
 ) -> np.ndarray:
     """Check a network's output, and convert it to (N, 1, H, W) float32 logits.
 
-    Probabilities that float32 rounds to 0 or 1 are first moved slightly inwards, because their
-    logits would be infinite.
+    Probabilities that float32 rounds to 0 or 1 are clipped, as their logits would be infinite.
     """
     wanted = (image_shape[0], 1, *image_shape[2:])
     if output.shape != wanted or output.dtype != np.float32:
@@ -84,10 +82,7 @@ def unreadable(path: Path, error: Exception) -> WeightsError:
 
 
 def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
-    """Return the error for a failed run on images of shape (N, 3, H, W).
-
-    It is a MemoryError if memory was short.
-    """
+    """Return the error for a failed run on (N, 3, H, W): a MemoryError if memory was short."""
     if any(word in f"{type(error).__name__} {error}" for word in ("MemoryError", "alloc")):
         return MemoryError(str(error))
     height, width = image_shape[2:]
@@ -98,9 +93,6 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
 
 
 def _reason(error: Exception) -> str:
-    """Return the line of a runtime's error message that states the reason.
-
-    It is the first line, except in OpenVINO's messages, which begin with lines of file names.
-    """
+    """Return the line with the reason from a runtime's error: OpenVINO's begin with file names."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[-1] if lines[0].startswith("Exception from") else lines[0]

@@ -80,8 +80,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
             raise OptionError(
                 "this processor has no instructions for bfloat16: leave `precision` out"
             )
-    # The precision is always set: OpenVINO's default on newer CPUs is bfloat16, which changes
-    # the keypoints.
+    # The precision is always set: on newer CPUs the default is bfloat16, which moves keypoints.
     settings: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "bf16" if options.precision == "bfloat16" else "f32",
         "CPU_RUNTIME_CACHE_CAPACITY": COMPILED_LAYERS,

@@ -45,8 +45,8 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
     check_ranges(options, counts=("threads",))
     if path.suffix.lower() != ".onnx":
         raise WeightsError(
-            f"{path} is not an ONNX file: convert a safetensors file by `deepdetect dev average`"
-            ", a command of deepdetect-lab"
+            f"{path} is not an ONNX file: convert safetensors by `deepdetect dev average` of "
+            "the package deepdetect-lab"
         )
     name = options.backend
     if name == "auto":
@@ -58,8 +58,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
         value = getattr(options, option)
         if value != usual and name != needed:
             raise OptionError(
-                f'`{option}="{value}"` needs the backend {needed}, not {name}: leave one of the '
-                "two options out"
+                f'`{option}="{value}"` needs the backend {needed}, not {name}: leave out one'
             )
     require_packages(f"reading {path.name} with the backend {name}", name)
     file = path.stat()

@@ -139,8 +139,7 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
     found = read_metadata(model)
     if any(found.get(name, value) != value for name, value in ANY_SIZE.items()):
         raise WeightsError(
-            f"{path} has the fixed size {found.get('size')}: give the file from which it was "
-            "exported"
+            f"{path} has the fixed size {found.get('size')}: give the file that it was made from"
         )
     kept = {name: value for name, value in found.items() if name in ("weights", "licence")}
     return model, {"weights": path.name, **kept}

@@ -1,8 +1,7 @@
 """Features of candidate keypoints, which are the input of the ranker.
 
 They are measured relative to the candidate's own scale and strength, and hardly change if the image
-is rotated, zoomed or lit differently. So the ranker ranks the same points high in both images of a
-pair.
+is rotated, zoomed or lit differently. So the same points rank high in both images of a pair.
 """
 
 from __future__ import annotations
@@ -13,8 +12,7 @@ from ..._shared.machine import parallel_for
 from .hessian_scales import SIGMAS_PX, VARIANCES, Candidates, ScaleSpace
 
 RING_RADII = (1.0, 2.0, 3.5, 6.0)
-"""Radii of the rings on which the image is sampled around a candidate, in sigmas of its scale.
-Chosen by hand."""
+"""Radii of the rings of samples around a candidate, in sigmas of its scale. Chosen by hand."""
 
 RING_POINTS = 8
 """Number of sampled points on each ring, at equal angles. Chosen by hand."""

@@ -50,8 +50,7 @@ def describe_learned(
 
     `gray` is the (H, W) uint8 luma of the image, possibly scaled down. Angles that are missing or
     -1 are replaced by the dominant gradient orientations. `descriptor` is a name in
-    `DESCRIPTOR_GRAPHS`, or an ONNX file with the same inputs and output. Keypoints without sizes
-    raise an OptionError.
+    `DESCRIPTOR_GRAPHS`, or a similar ONNX file. Keypoints without sizes raise an OptionError.
     """
     kind = descriptor_type(descriptor)
     if not len(keypoints):
@@ -59,8 +58,7 @@ def describe_learned(
         return replace(keypoints, descriptors=none, descriptor_type=kind)
     if keypoints.sizes is None or not (keypoints.sizes > 0).all():
         raise OptionError(
-            "learned descriptors need keypoints with sizes above 0: use those of a PointDetector, "
-            "or RootSIFT"
+            "learned descriptors need sizes above 0: use a PointDetector's keypoints, or RootSIFT"
         )
     height, width = gray.shape
     factor = np.divide((width, height), keypoints.image_size).astype(np.float32)

@@ -36,16 +36,14 @@ GRID_CELLS = 16
 """Number of grid cells along the longer side of the image if `spread` is "grid". Chosen by hand."""
 
 DISTANCE_PX = 2.0
-"""Minimum distance between two keypoints. With 1.5 or 2.3 px instead, the ranker's score differs by
-less than 0.003."""
+"""Minimum distance of two keypoints. 1.5 or 2.3 px change the ranker's score by less than 0.003."""
 
 DISTANCE_PER_SIGMA = 1.0
 """Minimum distance between two keypoints, in sigmas of the smaller one, so that one structure is
 not found at several scales. It raised the ranker's score on photos/val from 0.539 to 0.543."""
 
 SIZE_PER_SIGMA = 2.5
-"""The size of a keypoint, the diameter that descriptors use, is this many times the sigma of its
-scale. Chosen by hand."""
+"""Diameter of a keypoint, for descriptors, divided by the sigma of its scale. Chosen by hand."""
 
 
 def least_distances(sigma_px: np.ndarray) -> np.ndarray:
@@ -91,10 +89,7 @@ def rank_candidates(
     ignore: np.ndarray | None = None,
     ranker: Ranker | None = None,
 ) -> tuple[Candidates, np.ndarray]:
-    """Return the candidates of a (H, W) uint8 image, and their logits.
-
-    These are the `strongest` candidates, those with the highest |det Hessian|; None: all.
-    """
+    """Return the `strongest` candidates (None: all) of a (H, W) uint8 image, and their logits."""
     height, width = gray.shape
     require_memory(
         f"points of an image of {width}x{height} pixels",

@@ -13,16 +13,14 @@ NMS_RADIUS = 2
 """A candidate is the maximum of its level within this many pixels in x and y. Chosen by hand."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
-"""Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Candidates come from seven
-levels. The finest level and the two coarsest ones only serve the features for ranking. Chosen by
-hand."""
+"""Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Seven levels have
+candidates. The finest and the two coarsest only serve the features for ranking. Chosen by hand."""
 
 VARIANCES = (SIGMAS_PX**2).astype(np.float32)
 """Squares of `SIGMAS_PX`, which normalise the derivatives."""
 
 LEAST_RESPONSE = 1e-8
-"""Minimum |det Hessian| of a candidate in an image with values in [0, 1]: anything less is a
-rounding error."""
+"""Minimum |det Hessian| of a candidate, for grey values in [0, 1]: less is rounding error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +45,7 @@ class Candidates:
         level, row, column: (N,) int64 level of the scale space, and pixel in it.
         xy: (N, 2) float64 sub-pixel positions in the image.
         sigma_px: (N,) float64 sigmas of the candidates' levels.
-        rank: (N,) int64 ranks among the candidates of all levels by |det Hessian| sigma^4; 0 is the
-            strongest.
+        rank: (N,) int64 ranks by |det Hessian| sigma^4 in all levels; 0 is the strongest.
     """
 
     level: np.ndarray

@@ -136,8 +136,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
             bent[4 + k] = total / np.float32(RING_POINTS) / strength * half
             bent[4 + RINGS + k] = brightest / strength * half
             bent[4 + 2 * RINGS + k] = darkest / strength * half
-        # One logarithm of a product replaces four. The product is at least 1e-28, so float32 does
-        # not round it to 0.
+        # One logarithm of a product replaces four. The product is at least 1e-28, never 0.
         for k in range(2 * RINGS):
             product, slopes = np.float32(1), np.float32(1)
             for j in range(k, _POINTS, 2 * RINGS):
