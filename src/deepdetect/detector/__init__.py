@@ -1,4 +1,4 @@
-"""The detectors: dense keypoints from the network's heat map, and ranked points."""
+"""The detectors: `DeepDetect` finds dense keypoints, `PointDetector` the best few."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The network as a detector: an image in, a heat map or dense keypoints out."""
+"""`DeepDetect`, which runs the network on images to get heat maps or dense keypoints."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from .heatmap import HeatmapOptions, compute_maps, memory_named
 from .pretrained import PRETRAINED, resolve_weights
 
 CHANNELS_OF_IMAGES = (
-    "give it with each image, as in detect(image, channels='bgr'); the network's own input is "
-    "`network_channels`"
+    "give it with each image, as in detect(image, channels='bgr'); `network_channels` is the order "
+    "in the network's own input"
 )
 
 
@@ -45,7 +45,7 @@ class HeatmapDetector(Protocol):
     """Anything that computes heat maps, from which keypoints can be selected."""
 
     def heatmap(self, image: Any) -> np.ndarray:
-        """Map an image to a (H, W) float32 probability of a keypoint."""
+        """Return the probabilities that the pixels of an image are keypoints, (H, W) float32."""
 
 
 AnyDetector = Detector | HeatmapDetector
@@ -54,30 +54,31 @@ AnyDetector = Detector | HeatmapDetector
 class DeepDetect:
     """The dense keypoint detector of the paper.
 
-    Its keypoints are pixels of the network's heat map. If you want a few thousand keypoints,
-    `PointDetector` finds better ones than the most probable pixels, without the network.
+    Its keypoints are the pixels to which the network gives a high probability. If you need only a
+    few thousand keypoints, use `PointDetector`: it finds better ones than the most probable pixels.
 
     Args:
         weights: name of bundled weights ("default", "dense", "free" or "espnet"), or an ONNX file.
-        max_keypoints: maximum number of keypoints per image, the most probable pixels. None: all
-            above the threshold. For a few thousand, `PointDetector` finds better ones.
+        max_keypoints: maximum number of keypoints per image; the most probable pixels are kept.
+            None: all pixels above the threshold.
         resolution: "auto" (images over two megapixels are scaled down to that), "native" (images
-            keep their size), or a number of pixels: the image is squashed to a square of that side,
-            as in the paper with 480.
-        backend: "auto" (ONNX Runtime, OpenVINO for bfloat16), "onnxruntime" or "openvino".
+            keep their size), or a number of pixels: images of any shape are resized to a square of
+            that side. The paper uses 480.
+        backend: "auto" (OpenVINO for bfloat16, else ONNX Runtime), "onnxruntime" or "openvino".
         device: "cpu", "cuda", or the name of any execution provider of ONNX Runtime.
         threads: number of threads. None: the backend's choice.
-        precision: number format of the network, "float32", or "bfloat16" with OpenVINO, which is
-            faster on processors with instructions for it. A few keypoints differ, and tiles are not
-            available.
+        precision: number format of the network, "float32" or "bfloat16". The latter is faster, but
+            needs OpenVINO and a processor with instructions for it. A few keypoints then differ,
+            and images cannot be divided into tiles.
         network_channels: order of the colours in the network's input: "rgb", or "bgr" as in the
-            paper's published code. For images of OpenCV keep "rgb", and call the methods with
+            paper's published code. For images read by OpenCV keep "rgb", and call the methods with
             `channels="bgr"`.
-        tta: "flip" averages over flips and quarter turns, so that a flipped or rotated image has
-            the same keypoints, in eight times the time.
-        tile_megapixels: size in megapixels of the tiles into which larger images are divided, with
-            resolution "native". Tiles take less memory and about twice the time. "auto": tiles only
-            if memory is short. Only weights of the network `fast` can be tiled.
+        tta: "none", or "flip", which averages the logits over eight flips and quarter turns of the
+            image: flipped or turned images get the same keypoints, in eight times the time.
+        tile_megapixels: size, in megapixels, of the tiles into which larger images are divided if
+            the resolution is "native". Tiles take less memory and about twice the time. "auto": an
+            image is divided only if memory is short. The weights "espnet" cannot run in tiles, only
+            those of the network `fast`, such as all other bundled weights.
 
     Attributes:
         backend: name of the backend in use.
@@ -124,7 +125,7 @@ class DeepDetect:
 
     @classmethod
     def from_pretrained(cls, folder: str | Path, **options: Any) -> Self:
-        """Load the network `deepdetect.onnx` of a folder, as `train` and model hubs write it.
+        """Load `deepdetect.onnx` from a folder that `deepdetect train` or a model hub has written.
 
         Args:
             folder: a folder on this computer; nothing is downloaded.
@@ -142,19 +143,20 @@ class DeepDetect:
         return {name: value for name, value in vars(self).items() if name != "_network"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # A pickled detector opens its network again, by names that are the same on all machines.
+        # A pickled detector opens its network again. Bundled weights are stored by their names,
+        # which are the same on all machines.
         vars(self).update(state, weights=resolve_weights(state["_portable"]))
         self._network, self.backend = open_network(self.weights, self._runtime)
 
     @property
     def runtime(self) -> str:
-        """What runs the network, such as "openvino, bfloat16": results depend on it."""
+        """The backend and precision that heat maps depend on, such as "openvino, bfloat16"."""
         precision = self._runtime.precision
         return self.backend if precision == "float32" else f"{self.backend}, {precision}"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Options and the digest of the weights: what heat maps depend on besides the image."""
+        """The options and the weights' digest, on which keypoints depend besides the image."""
         return {
             "detector": "network",
             "max_keypoints": self.max_keypoints,
@@ -200,8 +202,8 @@ class DeepDetect:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of its probabilities for one image.
 
-        Float32 rounds the highest probabilities to 1, but logits still rank these pixels. From the
-        two maps `select_keypoints` selects the keypoints that `detect` finds, with any options.
+        Float32 rounds the highest probabilities to 1, but logits still rank these pixels. Given the
+        two maps, `select_keypoints` returns the same keypoints as `detect` with the same options.
 
         Args:
             image, channels: see `heatmap`.
@@ -234,21 +236,22 @@ class DeepDetect:
         Args:
             image: see `heatmap`.
             threshold: minimum probability of a keypoint (tau in the paper).
-            density: keypoints per pixel, in (0, 1], instead of a threshold. This many are returned
-                even if there is little to detect.
-            max_keypoints: maximum number, the most probable pixels. None: that of the detector.
+            density: keypoints per pixel, in (0, 1]. If set, the threshold is not used: the most
+                probable pixels are returned, even if there is little to detect.
+            max_keypoints: maximum number of keypoints; the most probable pixels are kept. None: the
+                detector's `max_keypoints`.
             nms_radius: radius of non-maximum suppression in pixels (0: none).
             subpixel: refine positions to a fraction of a pixel.
             ignore: (H, W) array, true where no keypoint is wanted.
             channels: see `heatmap`.
 
         Returns:
-            The keypoints in row-major order, on pixel centres unless `subpixel`, with probabilities
-            as scores.
+            The keypoints in row-major order. They lie on pixel centres unless `subpixel` is set.
+            Their scores are probabilities.
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.
-            OptionError: an option is out of its range, or the mask has another size.
+            OptionError: an option is out of its range, or the mask has another size than the image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
         return self._select(load_image(image, channels=channels), options, ignore)
@@ -269,16 +272,16 @@ class DeepDetect:
         """Detect the dense keypoints of several images.
 
         Args:
-            images: in a list, a tuple or an array of four dimensions; their sizes may differ.
+            images: a list or tuple of images of any sizes, or an array of four dimensions.
             threshold, density, max_keypoints, nms_radius, subpixel, channels: see `detect`.
-            ignore: a mask for each image, or None, in a list or a tuple; or one array for all.
+            ignore: one mask for all images, or a list or tuple with a mask or None for each image.
 
         Returns:
             The keypoints of each image, in the order of the images.
 
         Raises:
             ImageError: an image cannot be read or is unsuitable.
-            OptionError: an option is out of its range, or a mask has another size.
+            OptionError: an option is out of its range, or a mask has another size than its image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
         masks, found = ignore_masks(ignore, batch_length(images)), []
@@ -307,12 +310,12 @@ class DeepDetect:
                 `detect`.
 
         Returns:
-            The keypoints as from `detect`, with (N, 128) uint8 descriptors, all of size 3 and
-            upright as in the paper.
+            The keypoints as from `detect`, with (N, 128) uint8 descriptors. As in the paper, all
+            are described upright and with a diameter of 3 pixels.
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.
-            OptionError: an option is out of its range, or the mask has another size.
+            OptionError: an option is out of its range, or the mask has another size than the image.
         """
         rgb = load_image(image, channels=channels)
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
@@ -350,10 +353,11 @@ def find_keypoints(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | None = None,
 ) -> Keypoints:
-    """Find the keypoints of a (H, W, 3) uint8 image, ranked by logits if it has any.
+    """Find the keypoints of a (H, W, 3) uint8 image with any detector.
 
-    The detector may be any object with a method `heatmap` or `detect` like the detectors of this
-    package. The selection applies to heat maps. None selects pixels with a probability above 0.5.
+    A detector is any object with a method `detect` or `heatmap` like those of this package. The
+    selection chooses pixels of a heat map, and None chooses those with a probability above 0.5. For
+    a `DeepDetect`, pixels are ranked by their logits.
     """
     check_selection(detector, selection)
     if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):

@@ -22,11 +22,12 @@ from .pretrained import STRIDE
 from .tiling import BYTES_PER_PIXEL, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
-"""The resolution "auto" scales larger images down to this number of pixels, because finer pixels
+"""The resolution "auto" scales images with more pixels down to this number, because finer pixels
 mostly show blur and noise."""
 
 RELEASE_PIXELS = 20_000_000
-"""The network's memory is released before the maps of images with more pixels are computed."""
+"""If an image with more pixels than this was scaled down for the network, the memory that the
+network keeps is released before its maps are enlarged."""
 
 MIN_TILE_MEGAPIXELS = 1.5
 """Minimum size of a tile: smaller tiles would consist mostly of overlap."""
@@ -41,14 +42,17 @@ class HeatmapOptions:
     """How an image is prepared for the network. The fields are options of `DeepDetect`.
 
     Attributes:
-        resolution: "native", a number of pixels, or "auto", which scales larger images down because
-            their finest pixels show blur and noise rather than structure, and the network needs
-            seconds and gigabytes for them.
-        network_channels: "rgb", or "bgr" as in the paper's published code, although the weights
-            were trained on RGB. It does not describe the input images.
-        tta: "none", or "flip": the mean of the logits over eight flips and quarter turns.
-        tile_megapixels: 1.5 or more; "auto": 2.7 if the image is too large for the free memory.
-            Only ONNX weights of the network `fast` can be tiled.
+        resolution: "native" (images keep their size), a multiple of 8 (images are resized to a
+            square of this side in pixels), or "auto". The latter scales images over two megapixels
+            down to that: their finest pixels show blur and noise rather than structure, and the
+            network would need seconds and gigabytes for them.
+        network_channels: order of the colours in the network's input: "rgb", or "bgr" as in the
+            paper's published code, although the weights were trained on RGB. The order in the
+            images that you give is another option, `channels`.
+        tta: "none", or "flip": the mean logits of eight flips and quarter turns of the image.
+        tile_megapixels: size of the tiles into which larger images are divided, 1.5 or more.
+            "auto": 2.7, and only if the image is too large for the free memory. Only ONNX weights
+            of the network `fast` can run in tiles.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -114,7 +118,7 @@ def compute_maps(
 
 @contextmanager
 def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
-    """Replace a MemoryError in the block by an error that names the size of the image."""
+    """Replace an error for lack of memory in the block by one that names the size of the image."""
     try:
         yield
     except Exception as error:
@@ -138,7 +142,7 @@ def _seen(rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
 
 
 def _enlarged(logits: np.ndarray, shape: tuple[int, ...]) -> Maps:
-    """Return the maps for an image of shape (H, W) from the logits of a scaled one."""
+    """Return the maps for an image of shape (H, W) from the logits of its scaled copy."""
 
     def enlarged(map_: np.ndarray) -> np.ndarray:
         return cv2.resize(map_, shape[::-1], interpolation=cv2.INTER_CUBIC)
@@ -164,12 +168,12 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
         return None
     raise OptionError(
         "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights of "
-        "the network fast, in float32"
+        "the network `fast`, in float32"
     )
 
 
 def _run(network: Network, rgb: np.ndarray) -> np.ndarray:
-    """Return the (H, W) logits of an image, padded to multiples of 8 for the network."""
+    """Return the (H, W) logits of an image, which is padded to multiples of 8 for the network."""
     height, width = rgb.shape[:2]
     planes = np.empty((1, 3, height + -height % STRIDE, width + -width % STRIDE), np.float32)
     fill_planes(rgb, planes[0])

@@ -1,4 +1,4 @@
-"""The detector of ranked points: an image in, its best keypoints of all scales out."""
+"""`PointDetector`, which finds the best keypoints of an image at all scales, and ranks them."""
 
 from __future__ import annotations
 
@@ -32,31 +32,34 @@ class Descriptor(Protocol):
     """Anything that describes keypoints, such as `PointDetector`."""
 
     def describe(self, image: Any, keypoints: Keypoints) -> Keypoints:
-        """Return the keypoints of an image with descriptors and their type."""
+        """Return the given keypoints of an image with descriptors and their type."""
 
 
 class PointDetector:
-    """The best keypoints of all scales, ranked by how likely they are to be found again.
+    """A detector of the best keypoints of all scales.
 
-    Keypoints are maxima of |det Hessian|, ranked by a small trained network; the network of
-    `DeepDetect` is not used. A few thousand of them beat the best pixels of its heat map.
+    Keypoints are maxima of |det Hessian|. A small trained network, not that of `DeepDetect`, ranks
+    them by how likely they are to be found again in another image. A few thousand of these
+    keypoints work better than as many pixels of `DeepDetect`'s heat map.
 
     Args:
-        max_keypoints: maximum number of keypoints. None: all.
-        spread: "none" takes the best, "grid" the best of each cell of a grid in turn, "anms" the
-            best that lie as far apart as their number allows.
+        max_keypoints: maximum number of keypoints per image. None: all.
+        spread: how keypoints are chosen if there are more than `max_keypoints`. "none" takes those
+            ranked highest. "grid" takes the best of each cell of a grid, then the second-best of
+            each, and so on. "anms" takes good ones that lie as far apart as their number allows.
         resolution: "auto" (images over two megapixels are scaled down to that) or "native" (images
             keep their size).
-        ranker: npz file of `deepdetect dev train-points` that ranks the points. None: the bundled
-            one.
-        descriptor: type of the descriptors: "learned", by a small network that also sees the
-            surroundings of a keypoint; "learned-free", by one trained only on freely licensed
-            images; "cross-modal", for images of different sensors, such as infrared and visible
-            light, or a map; the ONNX file of `deepdetect train-descriptor`; or "rootsift", for
-            programs that expect SIFT's. Or an object with a method `describe(image, keypoints)`
-            that returns the keypoints with descriptors, as `PointDetector.describe` does.
-        backend, device, precision: arguments of `DeepDetect`. Points only run with ONNX Runtime on
-            the CPU in float32, and other values raise an error.
+        ranker: npz file of the network that ranks the keypoints, written by `deepdetect dev
+            train-points`. None: the bundled file.
+        descriptor: what describes the keypoints. "learned" is a small network that also sees the
+            surroundings of a keypoint. "learned-free" is the same network, trained only on freely
+            licensed images. "cross-modal" is for images of different sensors, such as infrared and
+            visible light, or for maps. "rootsift" is for programs that expect SIFT descriptors. A
+            path is an ONNX file written by `deepdetect train-descriptor`. An object needs a method
+            `describe(image, keypoints)` that returns the keypoints with descriptors, as
+            `PointDetector.describe` does.
+        backend, device, precision: as in `DeepDetect`, but keypoints are only computed with ONNX
+            Runtime on the CPU in float32, and other values raise an OptionError.
         threads: maximum number of threads. None: one per processor.
 
     Raises:
@@ -93,14 +96,14 @@ class PointDetector:
         ):
             if value not in known:
                 raise OptionError(
-                    f"`{name}={value!r}` is not available for points: leave it out, or use a "
+                    f"`{name}={value!r}` is not available in PointDetector: leave it out, or use a "
                     "DeepDetect"
                 )
         check_ranges(RuntimeOptions(threads=threads), counts=("threads",))
         self.threads = threads
         check_name("spread", spread, SPREADS)
         if spread != "none" and max_keypoints is None:
-            raise OptionError(f"`spread={spread!r}` needs `max_keypoints`: how many to spread")
+            raise OptionError(f"`spread={spread!r}` needs `max_keypoints`, the number to spread")
         check_name("resolution of points", resolution, ("auto", "native"))
         self.max_keypoints = None if max_keypoints is None else int(max_keypoints)
         self.spread, self.resolution = spread, resolution
@@ -118,7 +121,7 @@ class PointDetector:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Options and the digest of the ranker: what keypoints depend on besides the image."""
+        """The options and the ranker's digest, on which keypoints depend besides the image."""
         return {
             "detector": "points",
             "ranker": file_digest(self.ranker),
@@ -140,7 +143,7 @@ class PointDetector:
 
         Args:
             image: anything `load_image` takes.
-            max_keypoints: maximum number. None: that of the detector.
+            max_keypoints: maximum number of keypoints. None: the detector's `max_keypoints`.
             ignore: (H, W) array, true where no keypoint is wanted.
             channels: order of the colours in arrays and tensors: "rgb", or "bgr" as in OpenCV.
 
@@ -166,8 +169,8 @@ class PointDetector:
         """Detect the best keypoints of several images.
 
         Args:
-            images: in a list, a tuple or an array of four dimensions; their sizes may differ.
-            ignore: a mask for each image, or None, in a list or a tuple; or one array for all.
+            images: a list or tuple of images of any sizes, or an array of four dimensions.
+            ignore: one mask for all images, or a list or tuple with a mask or None for each image.
             max_keypoints, channels: see `detect`.
 
         Returns:
@@ -198,13 +201,13 @@ class PointDetector:
             image, max_keypoints, ignore, channels: see `detect`.
 
         Returns:
-            The keypoints as from `detect`, with descriptors at their own sizes and angles: (N, 64)
-            float32 learned ones of length 1, or (N, 128) uint8 RootSIFT.
+            The keypoints as from `detect`, described at their own sizes and angles. Learned
+            descriptors are (N, 64) float32 unit vectors, RootSIFT is (N, 128) uint8.
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.
             OptionError: the mask has another size than the image.
-            WeightsError: the descriptor's file is damaged.
+            WeightsError: the ONNX file of the descriptor is damaged.
         """
         rgb = load_image(image, channels=channels)
         return self.describe(rgb, self._find(rgb, ignore, max_keypoints))
@@ -213,16 +216,17 @@ class PointDetector:
     def describe(
         self, image: Any, keypoints: Keypoints, *, channels: Channels = "rgb"
     ) -> Keypoints:
-        """Describe keypoints, also of other detectors, as `extract` does.
+        """Describe keypoints of this or another detector, as `extract` does.
 
         Args:
             image, channels: see `detect`.
-            keypoints: keypoints with sizes; missing angles, or -1, become the dominant ones.
+            keypoints: keypoints with sizes (RootSIFT does not need them). Angles that are missing
+                or -1 are replaced by the dominant gradient orientations.
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.
-            OptionError: keypoints have no sizes above 0.
-            WeightsError: the descriptor's file is damaged.
+            OptionError: a size is not above 0, or learned descriptors lack sizes.
+            WeightsError: the ONNX file of the descriptor is damaged.
         """
         rgb = load_image(image, channels=channels)
         if isinstance(self.descriptor, Descriptor):
@@ -253,7 +257,7 @@ class PointDetector:
         size = (gray.shape[1], gray.shape[0])
         scaled = size != (width, height)
         if scaled and ignore is not None:
-            # A small pixel is ignored if it, or one next to it, covers an ignored pixel.
+            # A pixel of the scaled image is ignored if it or a neighbour covers an ignored pixel.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
         with memory_named(gray.shape), limited_threads(self.threads):

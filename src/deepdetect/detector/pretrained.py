@@ -10,34 +10,35 @@ from .._shared.options import look_up, names_a_file
 FOLDER = Path(__file__).parent / "weights"
 
 RANKER = Path(__file__).parent / "points" / "ranker.npz"
-"""The trained ranker of points; for its card see MODEL_CARD.md in the same folder."""
+"""Weights of the network that ranks keypoints. MODEL_CARD.md in the same folder describes them."""
 
 POINTS_GRAPH = RANKER.with_name("points.onnx")
-"""ONNX graph of the whole detection of points, for export."""
+"""ONNX graph of the whole `PointDetector`, which exported ONNX files can include."""
 
 PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
-    "dense": "dense",  # two views of a scene in normal light, denser
-    "free": "free",  # like default, trained only on freely licensed photographs
+    "dense": "dense",  # two views of a scene in normal light; more keypoints
+    "free": "free",  # like `default`, but trained only on freely licensed photographs
     "espnet": "espnet",  # the paper's network, for photographs in any light
 }
-"""File names without suffix, by the names that users choose."""
+"""Files of the bundled weights, without their suffix, by the names that users choose."""
 
 STRIDE = 8
-"""The network halves an image three times, so its sides must be multiples of 8."""
+"""The network halves an image three times, so the image's sides must be multiples of 8."""
 
 PADDED_IMAGE = "padded_image"
-"""Name of the tensor that holds the image padded to multiples of 8, in files that pad it."""
+"""Name of the padded image, in ONNX files that pad the image to multiples of 8 themselves."""
 
 LOGITS = "logits"
-"""Name of the output that holds logits; an output of another name holds probabilities."""
+"""Name of the ONNX output that holds logits; an output of another name holds probabilities."""
 
 POINTS = "keypoints", "scores", "sizes", "angles"
-"""Names of further outputs of ONNX files with points. This package does not read these outputs."""
+"""Names of the additional outputs of ONNX files that include a `PointDetector`. They are for other
+programs: this package does not read them."""
 
 
 def pretrained_weights(name: str = "default") -> Path:
-    """Return the path of bundled weights; an OptionError suggests the nearest known name."""
+    """Return the path of bundled weights; an OptionError for an unknown name suggests another."""
     return (FOLDER / look_up("name or file of weights", name, PRETRAINED)).with_suffix(".onnx")
 
 

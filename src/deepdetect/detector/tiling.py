@@ -1,4 +1,4 @@
-"""Running the network `fast` in tiles, for images that are too large for the memory.
+"""Running the network `fast` in tiles, for images whose computation would not fit in memory.
 
 The network uses a few numbers about the whole image: its exposure, and the means and maxima of the
 features. A first pass over the tiles collects these numbers, and a second pass computes the logits.
@@ -38,17 +38,19 @@ AVERAGES, MAXIMA = (
     for kind in ("Average", "Max")
 )
 THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
-"""Tensors at which the network is cut, as `export_onnx` names them; all have four dimensions."""
+"""The constants from `COUNTED` on name the tensors at which the network is cut. The names are those
+that `export_onnx` gives. All tensors have four dimensions."""
 
 SCALES = (4, 2, 1)
-"""The features have this many columns and rows for each 8 pixels (`STRIDE`) of the image."""
+"""The three feature maps have this many columns for every 8 pixels (`STRIDE`) of the image's width,
+and as many rows for every 8 pixels of its height."""
 
 MARGIN = 4
-"""Each tile is enlarged by this many strides of 8 pixels on all sides, because the convolutions see
-up to 28 px."""
+"""Each tile is enlarged on all sides by this many strides of 8 pixels, because the convolutions
+depend on pixels up to 28 px away."""
 
 BYTES_PER_PIXEL = 90
-"""Approximate memory per pixel, in bytes, that a run without tiles takes in either runtime."""
+"""Approximate memory, in bytes per pixel, of a run without tiles in ONNX Runtime or OpenVINO."""
 
 DEFAULT_TILE_MEGAPIXELS = 2.7
 
@@ -59,9 +61,10 @@ Part = Callable[..., list[np.ndarray]]
 class TiledNetwork:
     """A network cut into four parts.
 
-    `expose` maps the subsampled luma to its mean and the gain. `encode` maps an image, mean and
-    gain to features. `threshold` maps the subsampled luma and the means and maxima of the features
-    to thresholds. `decode` maps an image, mean, gain and thresholds to logits.
+    `expose` maps the subsampled luma of the image to its mean and the exposure gain. `encode` maps
+    a tile, the mean and the gain to features. `threshold` maps the subsampled luma, and the means
+    and maxima of the features over all tiles, to thresholds. `decode` maps a tile, the mean, the
+    gain and the thresholds to logits.
     """
 
     expose: Part
@@ -103,7 +106,7 @@ class TiledNetwork:
 
 
 def open_tiled(path: Path, threads: int | None = None) -> TiledNetwork | None:
-    """Cut the network of an ONNX file into parts; None if it is not the network `fast`."""
+    """Return the network of an ONNX file, cut into parts; None if it is not the network `fast`."""
     state = path.stat()
     return _open(path.absolute(), threads, (state.st_mtime_ns, state.st_size))
 
@@ -113,13 +116,13 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
     model = path.read_bytes()
 
     def part(inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Part:
-        # Memory that sessions keep would add up over the parts.
+        # The memory that each session keeps between runs would add up over the four parts.
         session = start_session(cut_onnx(model, inputs, outputs), threads, keep_memory=False)
 
         def run(*given: np.ndarray) -> list[np.ndarray]:
             try:
                 found: list[np.ndarray] = session.run(None, dict(zip(inputs, given, strict=True)))
-            except Exception as error:  # its exceptions share no base class
+            except Exception as error:  # the runtime's exceptions share no base class
                 raise DeepDetectError(
                     f"the network failed on a tile ({first_line(error)}), most likely for "
                     "lack of memory: use a smaller `tile_megapixels`, or `resolution='auto'`"
@@ -135,12 +138,15 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
             part((COUNTED, *AVERAGES, *MAXIMA), (THRESHOLDS,)),
             part(("image", *LIGHT, THRESHOLDS), (LOGITS,)),
         )
-    except Exception:  # a tensor is missing, or needs further inputs
+    except Exception:  # a tensor is missing, or depends on further inputs
         return None
 
 
 class _Span(NamedTuple):
-    """A tile on one axis, in strides: `seen` is read, `core` written, `inner` is core in seen."""
+    """The extent of a tile along one axis, in strides of 8 pixels.
+
+    `seen` is read, and `core` is written. `inner` is the position of `core` within `seen`.
+    """
 
     seen: slice
     core: slice
@@ -148,7 +154,7 @@ class _Span(NamedTuple):
 
 
 def _spans(length: int, side: int) -> list[_Span]:
-    """Divide a length into the fewest equal parts that, with margins, are no longer than `side`."""
+    """Divide a length into the fewest equal parts that, with margins, are at most `side` long."""
     count = 1
     while (core := -(-length // count)) + MARGIN * min(count - 1, 2) > side and core > MARGIN:
         count += 1
@@ -166,7 +172,7 @@ def _times(span: slice, scale: int) -> slice:
 
 
 def _planes(rgb: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-    """Return a tile as (1, 3, H, W) float32, without padding at the end of the image."""
+    """Return a tile as (1, 3, H, W) float32; at the end of the image it is not padded."""
     tile = rgb[_times(rows, STRIDE), _times(columns, STRIDE)]
     planes = np.empty((1, 3, *tile.shape[:2]), np.float32)
     fill_planes(tile, planes[0])

@@ -23,17 +23,17 @@ Points = tuple[np.ndarray, tuple[int, int]]
 
 
 def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.ndarray:
-    """Convert an image of any kind with this (width, height) to (H, W, 3) uint8 RGB."""
+    """Convert an array, tensor or PIL image of this (width, height) to (H, W, 3) uint8 RGB."""
     if isinstance(image, (str, bytes)) or hasattr(image, "__fspath__"):
         raise ImageError("drawing needs the image itself, not a path: give load_image(path)")
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
-        deep = image.mode.startswith(("I", "F"))  # Pillow would clip these
+        deep = image.mode.startswith(("I", "F"))  # Pillow would clip the values
         image, channels = deep_values(image) if deep else np.asarray(image.convert("RGB")), "rgb"
     rgb = array_to_rgb(image, channels)
     if rgb.shape[1::-1] != size:
         raise ImageError(
-            f"the image has {rgb.shape[1]}x{rgb.shape[0]} pixels, but that of the keypoints has "
-            f"{size[0]}x{size[1]}: give the image in which they were detected"
+            f"the image has {rgb.shape[1]}x{rgb.shape[0]} pixels, but the keypoints were "
+            f"detected in one of {size[0]}x{size[1]} pixels: give that image"
         )
     return rgb
 
@@ -44,10 +44,11 @@ def html_summary(
     points: Sequence[Points],
     lines: np.ndarray | None = None,
 ) -> str:
-    """Return a small HTML table and a figure of the positions of keypoints, about 10 kB.
+    """Return HTML of about 10 kB with a small table and a figure of the positions of keypoints.
 
-    The figure shows one image or two, side by side, and some of the (M, 4) `lines`, which connect
-    positions x0, y0 in the first and x1, y1 in the second.
+    `points` holds the positions and the (width, height) of one image, or of two, which are shown
+    side by side. The rows of `lines`, (M, 4), are x0, y0 in the first image and x1, y1 in the
+    second; some of these lines are drawn.
     """
     cells = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(text)}</td></tr>"
@@ -75,5 +76,7 @@ def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.
         chosen = np.sort(np.random.default_rng(0).permutation(len(lines))[:MAX_LINES])
         for x0, y0, x1, y1 in lines[chosen] * scale:
             start, end = (round(x0), round(y0)), (round(x1) + widths[0], round(y1))
-            cv2.line(picture, start, end, (90, 220, 255))  # antialiasing makes PNG 5 times larger
+            cv2.line(
+                picture, start, end, (90, 220, 255)
+            )  # antialiased lines would make the PNG 5 times larger
     return picture

@@ -1,9 +1,10 @@
 """Compiled functions for descriptors, orientations, matchers, nearest keypoints and suppression.
 
 Dense SIFT works in tiles, so that intermediate results stay in the processor's cache. Each pixel of
-a tile votes for eight soft orientations. These are summed along its row into the descriptor's four
-columns, then along the column into its four rows. The innermost loops run over all keypoints in a
-row of the tile and their orientations, which are adjacent in memory.
+a tile divides its vote between the two nearest of eight orientations. The votes are summed along
+the rows of the image into the four columns of bins of each descriptor, and then along the columns
+of the image into the four rows of bins. The innermost loops run over all keypoints in a row of the
+tile and their orientations, which are adjacent in memory.
 """
 
 from __future__ import annotations
@@ -15,36 +16,41 @@ import numpy as np
 from .._shared.kernels import compiled
 
 TILE_COLUMNS = 32
-"""Number of lattice columns in a tile. Chosen by hand."""
+"""Width of a tile of dense SIFT, in columns of the lattice of keypoints. Chosen by hand."""
 
 TILE_HEIGHT = 96
-"""Height of a tile in pixels. Chosen by hand."""
+"""Height of a tile of dense SIFT, in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
-"""The length of a span of filter taps is a multiple of this number, which are summed in one go."""
+"""This many taps of the filters of dense SIFT are summed in one go, so the length of each span of
+taps is a multiple of it."""
 
 BINS = 36
-"""Number of directions that gradients vote for, as in Lowe (2004)."""
+"""Number of bins in the histogram of gradient directions around a keypoint, as in Lowe (2004)."""
 
 RADIUS_PER_WINDOW = 3.0
-"""Radius within which pixels vote, in sigmas of the Gaussian window, as in OpenCV."""
+"""Radius within which pixels vote for the direction of a keypoint, in sigmas of the Gaussian window
+around it, as in OpenCV."""
 
 CHUNK = 64
-"""The minima of chunks of this many distances are stored, to find the nearest in one pass."""
+"""The exact search keeps the minimum of each chunk of this many distances, so that it need not
+compare all distances again for every further neighbour."""
 
 MIN_SQUARED_NORMS = 1e-3
-"""Minimum of the product of two squared norms: a descriptor that equals the mean has norm 0."""
+"""A correlation is divided by the square root of the product of two squared norms. This is the
+minimum of the product, because a descriptor that equals the mean has norm 0."""
 
 
 @compiled(nogil=True, fastmath=True)
 def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, taps, spans, out):  # type: ignore[no-untyped-def]
     """Write the descriptors of the keypoints in tiles `first` to `last` (exclusive) into `out`.
 
-    The (H, W) float32 orientations are in units of 45 degrees. `rows_of` holds, for each point of
-    the lattice, its row in `out`, or -1 without a keypoint. The first point of the lattice is the
-    pixel (x, y) `origin`. `taps`, (4, T), holds for each of four bins the weights of the T pixels
-    around a keypoint, padded by zeros. `spans`, (4, 3), holds for each bin the first tap, the end
-    of the nonzero taps in whole groups of `TAPS_AT_ONCE`, and T.
+    The orientations, (H, W) float32, are in units of 45 degrees. Keypoints lie on a lattice, whose
+    first point is the pixel `origin`, (x, y), and whose points are `step` pixels apart. `rows_of`
+    holds the row in `out` of the keypoint at each point of the lattice, or -1 if there is none.
+    `taps`, (4, T), holds the weights of T pixels along one axis around a keypoint, for each of the
+    four spatial bins, padded with zeros. `spans`, (4, 3), holds for each bin the first nonzero tap,
+    the end of its taps, rounded up to whole groups of `TAPS_AT_ONCE`, and T.
     """
     height, width = magnitude.shape
     reach = spans[0, 2] // 2
@@ -69,7 +75,7 @@ def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, t
             left += 1
         while (rows_of[top:bottom, right - 1] < 0).all():
             right -= 1
-        numbers = 8 * (right - left)  # one bin: eight orientations of each column
+        numbers = 8 * (right - left)  # numbers per spatial bin: eight orientations for each column
         x0, y0 = origin[0] + left * step - reach, origin[1] + top * step - reach
         for j in range((bottom - top - 1) * step + 2 * reach + 1):
             y = y0 + j
@@ -154,7 +160,7 @@ def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
                 out[32 * b + 8 * c + o] = np.uint8(min(np.float32(255), value))
 
 
-# With full fastmath, division and root are approximate, so equal descriptors do not give 0.
+# Full fastmath would approximate division and root, and equal descriptors would not give 0.
 @compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
 def correlation_distances(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
     """Write 1 - correlation of the descriptor pairs `start` to `stop` (exclusive) into `out`."""
@@ -176,8 +182,8 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
 def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
     """Find, for each position, the nearest of (M, 2) keypoints in the 3x3 pixels around it.
 
-    `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. Nothing is written for
-    positions that are not finite or have no keypoint near.
+    `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. `nearest` is not written for
+    positions that are not finite or have no keypoint in these pixels.
     """
     height, width = grid.shape
     for k in range(first, last):
@@ -200,7 +206,7 @@ def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # ty
 
 @compiled(nogil=True, inline="always")
 def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
-    """Return the squared Euclidean distance; in 32 bits throughout, for speed."""
+    """Return the squared Euclidean distance of uint8 descriptors, in 32-bit integers for speed."""
     total = np.int32(0)
     for d in range(queries.shape[1]):
         gap = np.int32(np.int32(queries[query, d]) - np.int32(base[row, d]))
@@ -210,7 +216,7 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, inline="always")
 def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
-    """Return the two nearest rows and their distances after adding a candidate row."""
+    """Return the two nearest rows and their distances after trying one further row."""
     if distance < nearer:
         return row, best, distance, nearer
     if distance < farther:
@@ -218,15 +224,16 @@ def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-un
     return best, second, nearer, farther
 
 
-# If NaN cannot occur, vector instructions find minima.
+# The flag "nnan" rules out NaN, so that the compiler can find minima by vector instructions.
 @compiled(nogil=True, fastmath={"nnan", "nsz"})
 def scan_products(products, terms0, terms1, start, rows, values, nearest, best, second):  # type: ignore[no-untyped-def]
     """Find nearest neighbours in both directions between a block of queries and the base.
 
     Squared distances are `terms0[i] + terms1[j] - 2 * products[i, j]`. The first query of the block
-    has the number `start`. For each query, the (Q, K) nearest rows of the base (the lower one of
-    equals) and their squared distances are written. For each of the M rows of the base, the nearest
-    query of all blocks so far and the squared distances of the two nearest queries are updated.
+    has the number `start`. `rows` and `values`, (Q, K), get the K nearest rows of the base for each
+    query (the lower row of a tie) and their squared distances. `nearest`, `best` and `second`
+    are updated for each of the M rows of the base: the nearest query in all blocks so far, and the
+    squared distances of the two nearest queries.
     """
     count = products.shape[1]
     chunks = (count + CHUNK - 1) // CHUNK
@@ -264,7 +271,7 @@ def _least(line, chunk):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, inline="always")
 def _hash(number):  # type: ignore[no-untyped-def]
-    """Return a hash of a number (Wellons's lowbias32)."""
+    """Return a 32-bit hash of a number, by the function lowbias32."""
     number = np.uint32(number)
     number ^= number >> np.uint32(16)
     number = np.uint32(number * np.uint32(0x7FEB352D))
@@ -276,7 +283,7 @@ def _hash(number):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def patchmatch_start(first, last, queries, base, seed, rows, distances):  # type: ignore[no-untyped-def]
-    """Give each of the queries `first` to `last` (exclusive) two random rows of the base."""
+    """Give each query from `first` to `last` (exclusive) two random rows of the base as matches."""
     count = len(base)
     for query in range(first, last):
         state = _hash(np.uint32(query) ^ _hash(np.uint32(seed)))
@@ -297,13 +304,15 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
     first, last, bands, queries, base, xy0, xy1, at0, at1, offsets, turn, seed, radii, before, rows,
     distances,
 ):  # fmt: skip
-    """Improve the two best rows of the queries in some bands, one query after the other.
+    """Improve the two best matches of each query in the bands `first` to `last` (exclusive).
 
-    `bands` holds the first query of each band, in row-major order. `at0` and `at1` hold the row of
-    the keypoint at each pixel of the two images, or -1. `before` holds the matches before this
-    sweep. It is used for queries in other bands, so that the order of the bands does not matter.
-    Even sweeps (`turn`) go down, odd ones up. Two kinds of candidates are tried: the shifted
-    matches of queries at `offsets`, and random keypoints within `radii` around the best match.
+    `bands` holds the number of the first query in each band; queries are in row-major order. `at0`
+    and `at1` hold the row of the keypoint at each pixel of the two images, or -1. `turn` is the
+    number of the sweep: even sweeps go down the image, odd ones up. Two kinds of candidates are
+    tried for a query: the matches of the queries at `offsets` from it, shifted by the offset, and
+    random keypoints within `radii` around its best match. `before` holds the matches before this
+    sweep. They are used if the other query is in another band, so that the order in which bands are
+    processed does not matter.
     """
     (height0, width0), (height1, width1) = at0.shape, at1.shape
     direction = 1 - 2 * (turn % 2)
@@ -316,7 +325,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
             nearer, farther = distances[query, 0], distances[query, 1]
             state = _hash(np.uint32(query) ^ _hash(np.uint32(seed + 7919 * (turn + 1))))
             for trial in range(spread + len(radii)):
-                if trial < spread:  # the shifted matches of two queries next to this one
+                if trial < spread:  # the match of a query at an offset in x or y, shifted by it
                     offset = offsets[trial // 4] * direction
                     right, down = (0, offset) if trial & 2 else (offset, 0)
                     x, y = xy0[query, 0] - right, xy0[query, 1] - down
@@ -329,7 +338,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
                         rows[other, trial & 1] if begin <= other < end else before[other, trial & 1]
                     )
                     x, y = xy1[row, 0] + right, xy1[row, 1] + down
-                else:  # random positions around the best
+                else:  # a random position around the best match
                     radius = radii[trial - spread]
                     state = _hash(state + np.uint32(1))
                     along = np.int64(state % np.uint32(2 * radius + 1)) - radius
@@ -352,9 +361,11 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
 def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignore[no-untyped-def]
     """Keep each point, best first, unless a kept one is closer than the smaller of their two radii.
 
-    Writes the rows of kept points into `kept` until it is full, and returns their number. Positions
-    must not be negative. The kept points of each square cell form a linked list: `last` holds the
-    last point of each cell, `before` the previous point of each point. -1 means none.
+    The points are ordered best first, and no position is negative. The rows of kept points are
+    written into `kept` until it is full, and their number is returned. To find near points, the
+    image is divided into squares with sides of `cell` pixels, `columns` of them in a row. The kept
+    points in each square form a linked list: `last` holds the last point of each square, `before`
+    the previous point of each point, and -1 means none.
     """
     rows, count = len(last) // columns, 0
     for k in range(len(x)):
@@ -382,15 +393,15 @@ ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-"""Coefficients of OpenCV's arctangent, in degrees, so that votes go to the same bins as there."""
+"""Coefficients of OpenCV's arctangent, in degrees: votes then go to the same bins as in OpenCV."""
 
 
 @compiled(nogil=True, error_model="numpy")
 def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def]
-    """Return the dominant gradient direction around (N, 2) pixels, (N,) float32 degrees.
+    """Return the dominant gradient directions around (N, 2) pixels, (N,) float32 degrees.
 
-    Gradients vote for `BINS` directions, weighted by a Gaussian window. Each pixel has its own
-    sigma, (N,). The outermost pixels of the image have no gradient.
+    Gradients vote for `BINS` directions, weighted by a Gaussian window around the pixel. `windows`
+    holds the sigmas of these windows. The outermost pixels of the image do not vote.
     """
     height, width = image.shape
     angles = np.zeros(len(pixels), np.float32)

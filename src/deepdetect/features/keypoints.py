@@ -1,4 +1,4 @@
-"""The keypoints of one image: positions, scores, and what descriptors need."""
+"""The keypoints of one image: positions, scores, sizes, angles and descriptors."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Diameter of a SIFT keypoint divided by its scale, if the scale means diameter or sigma."""
+"""Diameter of a keypoint divided by the "scale" for LightGlue, for both meanings of the scale."""
 
 MAX_COORDINATE_BITS = 12
-"""`bayer_order` uses at most this many bits of a position: float32 then holds the order exactly."""
+"""`bayer_order` uses this many bits of x and of y at most, so that float32 holds ranks exactly."""
 
 UNSET_ANGLE = -1
 """OpenCV gives this angle to keypoints without an orientation."""
@@ -37,18 +37,18 @@ class Keypoints:
     """Keypoints of one image.
 
     Attributes:
-        xy: (N, 2) float32 pixels, x right, y down, centre of the first pixel (0, 0).
+        xy: (N, 2) float32 positions in pixels, x to the right and y down; the centre of the first
+            pixel is (0, 0).
         scores: (N,) float32, higher is better. Those of a `PointDetector` lie in (0, 1) and all
             differ. Those of `DeepDetect` are probabilities; float32 rounds the highest to 1, so
             `best` ranks by logits.
         image_size: (width, height) of the image in pixels.
         logits: (N,) float32 logits of the probabilities, or None.
-        sizes: (N,) float32 diameters in pixels, or None if all keypoints have the same.
-        angles: (N,) float32 orientations in degrees (-1: unset), or None if all have the same.
-        octaves: (N,) int32 as packed by OpenCV, or None.
+        sizes: (N,) float32 diameters in pixels, or None if unknown.
+        angles: (N,) float32 orientations in degrees (-1: unset), or None if unknown.
+        octaves: (N,) int32 octaves and layers of SIFT, packed as in OpenCV, or None.
         descriptors: (N, D) uint8 or float32, or None if keypoints are not described.
-        descriptor_type: type of the descriptors, such as "rootsift"; None if unknown or without
-            any.
+        descriptor_type: type of the descriptors, such as "rootsift", or None if unknown.
 
     `len`, iteration over (x, y) rows and indexing by slices, masks and index arrays work.
 
@@ -115,7 +115,7 @@ class Keypoints:
     @classmethod
     @suggest_keywords
     def empty(cls, image_size: tuple[int, int]) -> Keypoints:
-        """Return an empty set of keypoints."""
+        """Return an empty set of keypoints for an image of this size."""
         return cls(np.empty((0, 2), np.float32), np.empty(0, np.float32), image_size)
 
     @classmethod
@@ -179,9 +179,9 @@ class Keypoints:
     ) -> dict[str, Any]:
         """Convert to the input of LightGlue for one image, as PyTorch tensors.
 
-        `LightGlue(features="sift")` needs sizes, angles and RootSIFT, which
-        `PointDetector(descriptor="rootsift")` computes; up to 4,096 keypoints are usual. Its pixel
-        coordinates are ours: the centre of the first pixel is (0, 0).
+        `LightGlue(features="sift")` needs sizes, angles and RootSIFT descriptors, as
+        `PointDetector(descriptor="rootsift")` computes them; up to 4,096 keypoints are usual.
+        LightGlue has the same pixel coordinates: the centre of the first pixel is (0, 0).
 
         Args:
             scale: meaning of "scales": "diameter", as in LightGlue's own extractor for OpenCV, or
@@ -222,8 +222,8 @@ class Keypoints:
     def draw(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray:
         """Draw the keypoints on their image, which is dimmed.
 
-        A circle shows the size of a keypoint; without sizes all have three pixels. More than 5,000
-        keypoints are drawn as single pixels.
+        Circles show the sizes of the keypoints; without sizes, all circles have a radius of three
+        pixels. More than 5,000 keypoints are drawn as single pixels.
 
         Args:
             image: an array, a PyTorch tensor or a PIL image.
@@ -248,9 +248,10 @@ class Keypoints:
 
     @suggest_keywords
     def best(self, count: int) -> Keypoints:
-        """Return the keypoints with the highest logits (or scores), in their present order.
+        """Return the `count` best keypoints, in their present order.
 
-        Among equal values, the chosen keypoints are spread evenly over the image.
+        Keypoints are ranked by logits or, without these, by scores. Ties are broken so that the
+        chosen keypoints are spread evenly over the image.
         """
         if len(self) <= (count := whole("count", count)):
             return self
@@ -259,9 +260,9 @@ class Keypoints:
         return self[np.sort(np.lexsort((order, -ranks))[:count])]
 
     def distinct(self) -> Keypoints:
-        """Keep the best keypoint of each position: SIFT repeats positions with several angles."""
+        """Keep only the best keypoint at each position: SIFT repeats a position for each angle."""
         order = np.argsort(-self.scores, kind="stable")
-        # Comparing both float32 as one number is ten times faster than rows; + 0 turns -0 into 0.
+        # Comparing x and y as one number is ten times faster than rows; + 0 turns -0 into 0.
         keys = np.ascontiguousarray(self.xy[order] + np.float32(0)).view(np.uint64).ravel()
         _, first = np.unique(keys, return_index=True)
         return self if len(first) == len(self) else self[np.sort(order[first])]
@@ -303,7 +304,7 @@ class Keypoints:
 
 
 def unit_length(descriptors: np.ndarray) -> np.ndarray:
-    """Return (N, D) descriptors as float32 of length 1."""
+    """Return (N, D) descriptors as float32, scaled to length 1."""
     values = descriptors.astype(np.float32)
     lengths = np.linalg.norm(values, axis=1, keepdims=True)
     unit: np.ndarray = values / np.maximum(lengths, np.finfo(np.float32).tiny)
@@ -311,10 +312,11 @@ def unit_length(descriptors: np.ndarray) -> np.ndarray:
 
 
 def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Rank (N, 2) positions by ordered dithering: any number of first ones is spread evenly.
+    """Rank (N, 2) positions so that the first of them, however many, are spread evenly.
 
-    The ranks, (N,) float32 in [0, 1), are the values at the nearest pixels of a Bayer matrix that
-    is as large as the image of this (width, height). Neighbouring pixels get distant ranks.
+    The ranks, (N,) float32 in [0, 1), come from ordered dithering. They are values of a Bayer
+    matrix that covers an image of this (width, height), each at the pixel nearest to the position.
+    Neighbouring pixels get very different ranks.
     """
     column, row = np.rint(np.asarray(xy).reshape(-1, 2)).astype(np.int64).T
     bits = min(MAX_COORDINATE_BITS, max(1, (max(size) - 1).bit_length()))
@@ -330,8 +332,8 @@ def nearest_keypoints(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the keypoint nearest to each of (N, 2) positions, within the 3x3 pixels around it.
 
-    The first of several keypoints on one pixel is used. Returns (N,) int32 rows of `xy` and (N,)
-    distances in pixels; -1 and infinity if no keypoint is near.
+    If several keypoints lie on one pixel, only the first is used. Returns (N,) int32 rows of `xy`
+    and (N,) distances in pixels; they are -1 and infinity if no keypoint is near.
     """
     from .kernels import nearest_of_nine
 
@@ -339,7 +341,9 @@ def nearest_keypoints(
     pixels = np.floor(np.asarray(xy) + np.float32(0.5)).astype(np.int64).reshape(-1, 2)
     rows = np.flatnonzero(((pixels >= 0) & (pixels < image_size)).all(axis=1))[::-1]
     grid = np.full((height, width), -1, np.int32)
-    grid[pixels[rows, 1], pixels[rows, 0]] = rows  # the first on a pixel is written last
+    grid[pixels[rows, 1], pixels[rows, 0]] = (
+        rows  # in reverse, so that the first keypoint on a pixel remains
+    )
     positions, xy = (np.ascontiguousarray(points, np.float64) for points in (positions, xy))
     nearest = np.full(len(positions), -1, np.int32)
     distances = np.full(len(positions), np.inf)

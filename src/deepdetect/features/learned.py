@@ -13,35 +13,37 @@ from .matchers import DescriptorMatches
 LEARNED: Final = "learned"
 LEARNED_FREE: Final = "learned-free"
 CROSS_MODAL: Final = "cross-modal"
-"""Values of `Keypoints.descriptor_type` for learned descriptors. The weights of the second are
-trained on freely licensed photographs only. The third is for images of different sensors, where
-dark and bright may be swapped. For your own weights the type is "learned-" or "cross-modal-" and
-the start of their SHA-256."""
+"""Values of `Keypoints.descriptor_type` for learned descriptors. "learned-free" was trained only on
+freely licensed photographs. "cross-modal" is for images of different sensors, in which dark and
+bright may be swapped. For your own weights, the type is "learned-" or "cross-modal-" and the start
+of the SHA-256 of their file."""
 
 RATIO, LEARNED_RATIO = 0.85, 0.88
-"""Thresholds of the ratio test, the first for other and the second for learned descriptors. On
-photos/val, learned ones at 0.88 are as precise as RootSIFT at 0.85, and match unrelated photographs
-no more often. At 0.93 they match unrelated photographs four times as often."""
+"""Thresholds of Lowe's ratio test: `LEARNED_RATIO` for learned descriptors, `RATIO` for all others.
+On photos/val, learned descriptors at 0.88 are as precise as RootSIFT at 0.85, and match unrelated
+photographs no more often. At 0.93 they match unrelated photographs four times as often."""
 
 LENGTH = 64
 
 CONSTANT = 16
-"""The first 16 numbers of a descriptor do not change if the image is rotated."""
+"""The first 16 numbers of a learned descriptor do not change if the image is rotated."""
 
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
-"""The remaining 48 numbers of a descriptor are the real parts and then the imaginary parts of 24
-complex numbers. Rotating the image adds the angle, times the factor here, to each one's phase."""
+"""The remaining 48 numbers of a descriptor are first the real and then the imaginary parts of 24
+complex numbers. If the image is rotated, the phase of each complex number grows by the angle of
+rotation times its factor in this array."""
 
 UPRIGHT_DEGREES = 15.0
-"""Rotations below this angle are not corrected: the network has learned to tolerate them."""
+"""Smaller rotations between images need not be undone: the networks have learned to bear them."""
 
 TURNED_KEYPOINTS = 512
-"""The rotation between two images is found by this many best keypoints of each. Chosen by hand."""
+"""This many keypoints of each image, the best ones, are matched to estimate the rotation between
+the images. Chosen by hand."""
 
 HISTOGRAM_DEGREES = 10
 NEAR_DEGREES = 20
-"""The first is the width of the bins of a histogram of angles, the second the distance from the
-fullest bin within which the median is taken. Both are in degrees and were chosen by hand."""
+"""`common_turn` makes a histogram of angles with bins of width `HISTOGRAM_DEGREES`. It returns the
+median of the angles within `NEAR_DEGREES` of the fullest bin. Both were chosen by hand."""
 
 
 def is_learned(descriptor_type: str | None) -> bool:
@@ -50,10 +52,10 @@ def is_learned(descriptor_type: str | None) -> bool:
 
 
 def angles_counted(descriptor_type: str) -> int:
-    """Return the multiple of a keypoint's angle by which its descriptor is rotated.
+    """Return the factor by which keypoint angles are multiplied before descriptors are rotated.
 
-    It is 2 for cross-modal descriptors: between sensors a gradient may point the opposite way, and
-    doubled angles are equal for opposite directions.
+    It is 2 for cross-modal descriptors, and 1 for others. In the image of another sensor, a
+    gradient may point the opposite way. Doubling makes the angles of opposite directions equal.
     """
     return 2 if descriptor_type.startswith(CROSS_MODAL) else 1
 
@@ -61,7 +63,7 @@ def angles_counted(descriptor_type: str) -> int:
 def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np.ndarray:
     """Rotate (N, 64) float32 learned descriptors, as if the image were rotated.
 
-    The angle, one for all or (N,), is in degrees from the x axis towards the y axis.
+    The angles, (N,) or one for all descriptors, are in degrees from the x axis towards the y axis.
     """
     real = CONSTANT + len(FREQUENCIES)
     once = np.exp(1j * np.radians(np.reshape(degrees, -1))).astype(np.complex64)
@@ -77,9 +79,10 @@ def match_learned(
 ) -> DescriptorMatches:
     """Match learned descriptors after undoing the rotation between the two images.
 
-    Descriptors rotated to the keypoints' own angles match under any rotation, and their matches
-    tell the rotation between the images. Upright descriptors, of which only this common rotation
-    is undone, distinguish more, and give about a sixth more matches.
+    Descriptors that are rotated to the keypoints' own angles match under any rotation of the image.
+    Matches of the best keypoints therefore tell the rotation between the images. All keypoints are
+    then matched by upright descriptors, of which only this common rotation is undone. These are
+    more distinctive, and give about a sixth more matches.
     """
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
     assert descriptors0 is not None

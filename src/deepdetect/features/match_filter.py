@@ -1,9 +1,10 @@
 """A filter of mutual nearest neighbours that compares each match with the matches around it.
 
-Correct matches move, rotate and change scale as their neighbours do, wrong matches at random. A
-network of 25,000 parameters (MATCH_FILTER_CARD.md) has learned how similar these changes are, also
-on surfaces that bend and move. Its input is Lowe's ratios but not the descriptors, so it suits
-several types. It replaces the ratio test, which discards correct matches on repeated structures.
+From one image to the other, correct matches move, rotate and change scale as their neighbours do,
+but wrong matches do so at random. A network of 25,000 parameters (MATCH_FILTER_CARD.md) has learned
+how similar the changes of neighbours are, also on surfaces that bend and move. It sees Lowe's
+ratios but not the descriptors, so it works with several types of descriptors. It replaces the ratio
+test, which discards correct matches on repeated structures.
 """
 
 from __future__ import annotations
@@ -25,17 +26,18 @@ from .sift import ROOT_SIFT
 MATCH_FILTER = Path(__file__).with_name("match_filter.onnx")
 
 AROUND = 8
-"""Each match is compared with this many nearest matches in either image: the network's input."""
+"""Each match is compared with the matches nearest to it: this many in each of the two images. The
+network needs exactly this number."""
 
 MOST_DISTINCT = 512
-"""Number of matches, those with the lowest ratios, that give the rotation. Chosen by hand."""
+"""This many matches, with the lowest ratios, give the rotation between images. Chosen by hand."""
 
 FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
-"""FLANN's tree for few dimensions, and its code for an exact search."""
+"""FLANN's codes for a kd-tree for few dimensions, and for an exact search."""
 
 
 def check_filter(filter_by: str, ratio: float | None, mutual: bool) -> None:
-    """Raise an OptionError if the name is unknown or the other options contradict it."""
+    """Raise an OptionError if `filter_by` is unknown, or if the other options contradict it."""
     check_name("filter_by", filter_by, ("ratio", "neighbours"))
     if filter_by == "neighbours" and (ratio is not None or not mutual):
         raise OptionError("`filter_by='neighbours'` needs `mutual=True` and no `ratio`")
@@ -44,7 +46,8 @@ def check_filter(filter_by: str, ratio: float | None, mutual: bool) -> None:
 def suits_filter(features: Keypoints) -> bool:
     """Return whether keypoints have sizes, angles and descriptors that the filter supports.
 
-    Cross-modal descriptors are not supported: inverted tones rotate keypoints by 180 degrees.
+    Cross-modal descriptors are not supported, because keypoints turn by 180 degrees where dark and
+    bright are swapped between the images.
     """
     kind, sizes, angles = features.descriptor_type, features.sizes, features.angles
     served = kind == ROOT_SIFT or (is_learned(kind) and not str(kind).startswith(CROSS_MODAL))
@@ -58,7 +61,7 @@ def require_suited(*features: Keypoints) -> None:
     if not all(map(suits_filter, features)):
         raise OptionError(
             "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "
-            "descriptors or RootSIFT, as `PointDetector.extract` returns them: use 'ratio' instead"
+            "descriptors or RootSIFT, as `PointDetector.extract` returns them: use 'ratio'"
         )
 
 
@@ -68,8 +71,8 @@ def filter_matches(
     """Keep the mutual nearest neighbours that are more likely correct than wrong.
 
     If there are at most `AROUND` matches, none is kept, because they have too few neighbours. The
-    keypoints must suit the filter. The `ratios` of the result are the probabilities, according to
-    the network, that a match is wrong.
+    keypoints must suit the filter (`suits_filter`). In the result, `ratios` are not Lowe's, but the
+    network's probabilities that matches are wrong.
     """
     if len(matches) <= AROUND:
         none = np.empty(0, np.int32)
@@ -83,7 +86,7 @@ def filter_matches(
 def filter_inputs(
     features0: Keypoints, features1: Keypoints, matches: DescriptorMatches
 ) -> dict[str, np.ndarray]:
-    """Return the network's inputs by name, after undoing the rotation between the images."""
+    """Return the network's inputs by name, with the rotation between the two images undone."""
     sizes, angles = [], []
     for features, rows in ((features0, matches.indices0), (features1, matches.indices1)):
         assert features.sizes is not None
@@ -109,11 +112,12 @@ def filter_inputs(
 
 
 def nearest_rows(xy: np.ndarray) -> np.ndarray:
-    """Return the (N, `AROUND`) rows of the nearest other positions, for N > `AROUND` positions."""
+    """Return the rows of the `AROUND` other positions nearest to each of N > `AROUND` positions."""
     own = np.arange(len(xy))[:, None]
     tree = cv2.flann_Index(xy, {"algorithm": FLANN_KDTREE_SINGLE, "leaf_max_size": 10})
     near = tree.knnSearch(xy, AROUND + 1, params={"checks": ALL_LEAVES})[0].astype(np.int64)
-    # A position's own row goes to the end. It may be missing if many positions coincide.
+    # A position's own row is moved to the end, and dropped there. If many positions coincide,
+    # its own row may be missing, and the last of the others is dropped.
     return np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]
 
 

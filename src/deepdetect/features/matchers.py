@@ -22,54 +22,61 @@ from .._shared.runtimes import start_session
 from .keypoints import on_pixels
 
 BLOCK_SIZE = 2_000_000
-"""Exact search works on blocks of this many float32 numbers: 8 MB, which fit most caches."""
+"""Exact search computes this many float32 distances at a time: 8 MB, which fit in most caches."""
 
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
-"""Distances of uint8 descriptors up to this length are exact in single precision."""
+"""Maximum length of uint8 descriptors whose squared distances are exact in single precision."""
 
 PRODUCTS = Path(__file__).with_name("products")
-"""ONNX files of one matrix product each, made by `tools/product_graphs.py`. NumPy's product in
-single precision takes twice the time, and its threads keep processors busy afterwards."""
+"""Folder of ONNX files with one matrix product each, made by `tools/product_graphs.py`. NumPy's
+product in single precision takes twice the time of ONNX Runtime's, and NumPy's threads keep
+processors busy afterwards."""
 
 MAX_EXACT_PRODUCT = 4e8
-"""The search is exact up to this product of both numbers of keypoints. Chosen by hand."""
+"""The matcher "auto" searches exactly if the product of the numbers of keypoints in the two images
+is at most this. Chosen by hand."""
 
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
-"""FLANN's code for kd-trees, number of trees and of visited leaves, as in the paper's code."""
+"""FLANN's code for kd-trees, the number of trees, and the number of leaves that each query visits,
+as in the paper's code."""
 
 SWEEPS = 4
-"""PatchMatch makes this many sweeps over all queries, down and up in turn. Chosen by hand."""
+"""Number of PatchMatch's sweeps over all queries, down and up the image in turn. Chosen by hand."""
 
 OFFSETS_PX = (1, 4, 12)
-"""PatchMatch tries the matches of queries at these distances. Dense keypoints are 1 px apart."""
+"""PatchMatch tries, for each query, the shifted matches of other queries at these distances in x or
+in y. The smallest is 1 because dense keypoints are 1 px apart."""
 
 BAND_HEIGHT_PX = 96
-"""Height of the bands that PatchMatch gives to threads. The result depends on it, not on the number
-of threads. Chosen by hand."""
+"""PatchMatch divides the first image into bands of this height, which threads process in parallel.
+The result depends on the height, but not on the number of threads. Chosen by hand."""
 
 SEARCH_SHRINK = 3
-"""PatchMatch's random search around the best neighbour starts with the whole image as radius, and
-divides the radius by this from try to try."""
+"""PatchMatch also tries random positions around the best match. The first radius is half the longer
+side of the image, and each further radius is the previous one divided by this number."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
-"""Nearest neighbours of N queries: (N, count) int32 rows and float32 distances, nearest first."""
+"""Nearest neighbours of N queries: their rows in the base, (N, count) int32, and their distances,
+(N, count) float32, nearest first."""
 
 Positions = tuple[np.ndarray, np.ndarray] | None
-"""Keypoints of both images in pixels; None if their scales or angles differ, so that nearby
-keypoints need not have nearby matches."""
+"""Positions of the queries and of the base in their images, in pixels. None if the keypoints differ
+in scale or angle: nearby keypoints then need not have nearby matches."""
 
 
 Matcher = Callable[[np.ndarray, np.ndarray, int, int, Positions], Neighbours]
-"""Finds for (N, D) queries the `count` nearest rows of an (M, D) base, M >= count, both uint8 or
-float32: `matcher(queries, base, count, seed, positions)`. The same seed gives the same result."""
+"""A function `matcher(queries, base, count, seed, positions)`. It finds, for each row of `queries`,
+(N, D), the `count` nearest rows of `base`, (M, D), with M >= count. Both arrays are uint8 or both
+are float32. The same seed gives the same result."""
 
 
 def exact_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
-    """Find the exact nearest neighbours by matrix products; a `Matcher`. Ties go to the lower row.
+    """Find the exact nearest neighbours by matrix products; a `Matcher`.
 
-    The time grows with the product of both numbers of keypoints: it suits tens of thousands.
+    Among equally near rows of the base, the lower one is taken. The time grows with the number of
+    queries times the number of rows, so this suits up to tens of thousands of keypoints.
     """
     return _search_both_ways(queries, base, count)[:2]
 
@@ -77,7 +84,7 @@ def exact_neighbours(
 def _search_both_ways(
     queries: np.ndarray, base: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `exact_neighbours`, and (M,) int32: the nearest query for each row of the base."""
+    """Return `exact_neighbours`, and the nearest query of each row of the base, (M,) int32."""
     from .kernels import scan_products
 
     width = base.shape[1]
@@ -91,7 +98,7 @@ def _search_both_ways(
     else:
         queries, base = (np.asarray(part, np.float32) for part in (queries, base))
         session, factor = _product("float"), np.ascontiguousarray(base.T)
-    found = min(count + 1, len(base))  # one more, to detect ties within rounding
+    found = min(count + 1, len(base))  # one more, to detect ties within rounding errors
     rows = np.empty((len(queries), found), np.int32)
     squared = np.empty((len(queries), found), np.float32)
     nearest = np.zeros(len(base), np.int32)
@@ -105,7 +112,8 @@ def _search_both_ways(
         scan_products(*block, rows[part], squared[part], nearest, best, second)
     if whole or not len(queries):
         return rows[:, :count], np.sqrt(squared[:, :count]), nearest
-    # Bounds of the rounding errors in the sums of the product, and in the terms.
+    # Rounding errors of the products and terms are below `bound`, relative to the descriptors'
+    # lengths. Neighbours that differ by less are searched again in double precision.
     lengths = np.sqrt(terms0), np.sqrt(terms1)
     bound = (width / 2 + 8) * float(np.finfo(np.float32).eps)
     doubt = bound * (lengths[0] + lengths[1].max()) ** 2
@@ -118,7 +126,7 @@ def _search_both_ways(
     rows.sort(axis=1)
     distances = np.empty((len(queries), count), np.float32)
     for part in parts:
-        # Computed from the differences, so that distances near 0 are exact.
+        # Distances are computed again, from the differences, so that those near 0 are exact.
         gaps = np.linalg.norm(queries[part, None] - base[rows[part]], axis=2)
         order = np.argsort(gaps, axis=1, kind="stable")
         rows[part] = np.take_along_axis(rows[part], order, 1)
@@ -127,13 +135,13 @@ def _search_both_ways(
 
 
 def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.ndarray:
-    """Return the rows of the nearest neighbours of few queries, in double precision."""
+    """Return the rows of the nearest neighbours of a few queries, in double precision."""
     rows = np.empty((len(queries), count), np.int32)
     squares = np.einsum("ij,ij->i", base, base, dtype=np.float64)
     step = max(1, BLOCK_SIZE // (2 * len(base)))
     for start in range(0, len(queries), step):
         block = squares - 2 * (queries[start : start + step].astype(np.float64) @ base.T)
-        for rank in range(count):  # argmin takes the lower of equal rows
+        for rank in range(count):  # `argmin` takes the lower row of a tie
             rows[start : start + step, rank] = nearest = block.argmin(1)
             block[np.arange(len(block)), nearest] = np.inf
     return rows
@@ -146,10 +154,11 @@ def _product(name: str) -> Any:
 
 @functools.cache
 def _byte_product() -> tuple[Any, int]:
-    """Return a session that multiplies bytes, and the offset to subtract from those of the base.
+    """Return a session that multiplies matrices of bytes, and the offset to subtract from the base.
 
-    The fastest instructions (VNNI) multiply unsigned by signed bytes. On processors without them,
-    sums of such products saturate, so both sides are unsigned.
+    The fastest instructions (VNNI) multiply unsigned by signed bytes: subtracting 128 makes those
+    of the base signed. On processors without VNNI, sums of such products saturate. There both
+    matrices stay unsigned, and the offset is 0.
     """
     session = _product("signed")
     most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
@@ -163,7 +172,9 @@ def hamming_neighbours(
 ) -> Neighbours:
     """Find nearest neighbours of binary descriptors by Hamming distance; a `Matcher`."""
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
-        raise OptionError("the matcher hamming compares binary descriptors: use exact or flann")
+        raise OptionError(
+            "the matcher 'hamming' is for binary descriptors, in uint8: use 'exact' or 'flann'"
+        )
     if not len(queries):
         return np.empty((0, count), np.int32), np.empty((0, count), np.float32)
     distances, rows = cv2.batchDistance(
@@ -181,9 +192,10 @@ def flann_neighbours(
     trees: int = TREES,
     checks: int = CHECKS,
 ) -> Neighbours:
-    """Find approximate nearest neighbours in random kd-trees, visiting `checks` leaves per query.
+    """Find approximate nearest neighbours by FLANN's randomised kd-trees.
 
-    The other arguments and the result are those of a `Matcher`.
+    `trees` is their number, and `checks` the number of leaves that each query visits. The other
+    arguments and the result are those of a `Matcher`.
     """
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
 
@@ -192,7 +204,8 @@ def flann_neighbours(
         index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
         return index.knnSearch(queries, count, params={"checks": checks})
 
-    # OpenCV has one random number generator per thread: the caller's stays as it is.
+    # OpenCV has one random number generator per thread. A thread of its own keeps this search
+    # from changing the caller's generator.
     with ThreadPoolExecutor(1) as thread:
         rows, squared = thread.submit(search).result()
     return rows, np.sqrt(squared)
@@ -203,21 +216,25 @@ def patchmatch_neighbours(
 ) -> Neighbours:
     """Find one or two approximate nearest neighbours of each query by PatchMatch; a `Matcher`.
 
-    The match of an adjacent query, shifted by the same distance, is probably good (Barnes et al.,
-    "PatchMatch", 2009). On hundreds of thousands of dense keypoints this takes a twentieth of
-    FLANN's time and finds more correct matches. It does not suit few or scattered keypoints.
-    Descriptors must be uint8 and keypoints on whole pixels. The number of threads has no effect.
+    If a query lies next to another one, the other's match, shifted by the offset between the two,
+    is probably a good match (Barnes et al., "PatchMatch", 2009). On hundreds of thousands of dense
+    keypoints this takes a twentieth of FLANN's time and finds more correct matches. It does not
+    suit few or scattered keypoints. Descriptors must be uint8 and keypoints on whole pixels. The
+    number of threads does not change the result.
     """
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(
-            "patchmatch needs dense keypoints of one scale and angle, on whole pixels: use auto"
+            "'patchmatch' needs dense keypoints of one scale and angle, on whole pixels: use 'auto'"
         )
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
-        raise OptionError("the matcher patchmatch needs descriptors of bytes: use flann or exact")
+        raise OptionError(
+            "the matcher 'patchmatch' needs uint8 descriptors: use 'flann' or 'exact'"
+        )
     from . import kernels
 
     xy0, xy1 = (np.asarray(xy).astype(np.int32) for xy in positions)
-    # Row-major order, as most detectors return: a sweep builds on the previous queries.
+    # Queries are sorted in row-major order, because a sweep builds on the queries before. Most
+    # detectors return keypoints in this order already.
     order = np.lexsort((xy0[:, 0], xy0[:, 1]))
     queries, xy0 = queries[order], xy0[order]
     at0, at1 = _grid(xy0), _grid(xy1)
@@ -240,7 +257,10 @@ def patchmatch_neighbours(
 
 
 def _grid(xy: np.ndarray) -> np.ndarray:
-    """Return the row at each pixel of the smallest image that holds all positions, or -1."""
+    """Return an image with the row of the position at each pixel, and -1 at pixels without one.
+
+    It is the smallest image that holds all positions.
+    """
     width, height = xy.max(axis=0) + 1
     grid = np.full((height, width), -1, np.int32)
     grid[xy[:, 1], xy[:, 0]] = np.arange(len(xy))
@@ -271,20 +291,21 @@ MATCHERS: dict[str, Matcher] = {
 }
 
 MATCHERS_OF_NUMBERS = tuple(name for name in MATCHERS if name != "hamming")
-"""All matchers except the one for binary descriptors such as ORB's."""
+"""Names of all matchers except the one for binary descriptors such as ORB's."""
 
 
 def get_matcher(name: str) -> Matcher:
-    """Return the matcher of this name; an unknown name is an OptionError."""
+    """Return the matcher of this name; an unknown name raises an OptionError."""
     return look_up("matcher", name, MATCHERS)
 
 
 @dataclass(frozen=True, eq=False)
 class DescriptorMatches:
-    """Matched rows (M,) of two sets of descriptors.
+    """Matches between two sets of descriptors.
 
-    `ratios` are Lowe's, (M,) float32: the distance to the best divided by that to the second-best.
-    After `filter_matches` they are the probabilities that matches are wrong.
+    `indices0` and `indices1` are the matched rows of the two sets, (M,) each. `ratios` are Lowe's,
+    (M,) float32: the distance to the nearest descriptor divided by that to the second-nearest.
+    After `filter_matches` they are instead the probabilities that matches are wrong.
     """
 
     indices0: np.ndarray
@@ -307,9 +328,9 @@ def match_descriptors(
 ) -> DescriptorMatches:
     """Match (N, D) with (M, D) descriptors by nearest neighbour and ratio test (Lowe, 2004).
 
-    Descriptors are uint8 or float32. Lowe's ratio must be below `ratio` (paper's code: 0.99).
-    `mutual` keeps only mutual nearest neighbours. `seed` and `positions` are passed to the matcher.
-    The matches are ordered by the row in the first set.
+    Descriptors are uint8 or float32. Matches are kept if Lowe's ratio is below `ratio`, which is
+    0.99 in the paper's code. `mutual` keeps only mutual nearest neighbours. `seed` and `positions`
+    are passed to the matcher. The matches are ordered by their rows in the first set.
     """
     if len(descriptors0) == 0 or len(descriptors1) < 2:  # there is no second-best neighbour
         none = np.empty(0, np.int32)
@@ -322,7 +343,7 @@ def match_descriptors(
         back = None if positions is None else positions[::-1]
         nearest = matcher(descriptors1, descriptors0, 1, seed, back)[0][:, 0] if mutual else rows
     best, second = distances[:, 0], distances[:, 1]
-    # Two neighbours at distance 0 are equally good: their ratio is 1.
+    # If both neighbours are at distance 0, they are equally good, and the ratio is 1.
     ratios = np.divide(best, second, out=np.ones_like(best), where=second > 0)
     kept = ratios < ratio
     if mutual:

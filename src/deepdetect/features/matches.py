@@ -16,7 +16,7 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""A match position belongs to a keypoint at most this far away. Chosen by hand."""
+"""The end of a match belongs to the nearest keypoint up to this far away. Chosen by hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,
@@ -33,16 +33,19 @@ class Evidence:
 
     Attributes:
         tentative_matches: number of tentative matches from which the geometry was first estimated.
-        tentative_inliers: number of those that agree with it, plus further matches along its lines.
-        log10_nfa: decimal logarithm of its number of false alarms (a contrario): how many
-            geometries with as many inliers are expected among random matches.
-        simulated_views: number of views that were simulated to find it, as in ASIFT.
+        tentative_inliers: number of tentative matches that agree with the geometry, plus further
+            matches that were found along its epipolar lines.
+        log10_nfa: decimal logarithm of the geometry's number of false alarms (a contrario): the
+            number of geometries with as many inliers that is expected among random matches.
+        simulated_views: number of views that were simulated to find the geometry, as in ASIFT.
         on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
-        verified: fraction of its proposals that the images confirm. A homography proposes partners
-            of keypoints; a fundamental matrix proposes a match for each keypoint of the first image
-            or, if only sparse matches are returned, for each of these.
-        correlation: median ZNCC of windows of both images, each placed by the matches around it,
-            not by its own: correct matches predict similar content. 0 if there are few matches.
+        verified: fraction of the matches proposed by the geometry that the images confirm. A
+            homography proposes partners of keypoints. A fundamental matrix proposes one match for
+            each keypoint of the first image. If only sparse matches are returned, the
+            `tentative_inliers` count as proposed.
+        correlation: median ZNCC between windows of the first image and their places in the second.
+            Each place is predicted by the matches around a window, not by those inside it, so it
+            shows the same content if the matches are correct. 0 if there are few matches.
     """
 
     tentative_matches: int = 0
@@ -62,13 +65,15 @@ class TwoViewGeometry:
 
     Attributes:
         model: "homography", "fundamental", "essential", or "none" if no geometry can be trusted.
-        matrix: (3, 3) float64; None if the model is "none". A homography maps the first image to
-            the second; else x1^T M x0 = 0 (essential: in normalised coordinates).
-        scene: "planar", "rotation" (of the camera; a flat scene may look like it), "depth", "depth
-            with a dominant plane", or "none" if the model is. With known cameras, matches of a
-            planar scene give two possible poses, those of a rotation no translation.
+        matrix: (3, 3) float64; None if the model is "none". A homography maps points of the first
+            image to the second. Other matrices M satisfy x1^T M x0 = 0 for points x0 and x1 of the
+            two images, in pixels or, for an essential matrix, in normalised coordinates.
+        scene: "planar", "rotation" (the camera only rotated; a flat scene may look the same),
+            "depth", "depth with a dominant plane", or "none" if the model is "none". If the cameras
+            are calibrated, matches of a planar scene leave two possible poses, and matches of a
+            rotation do not tell the translation.
         confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" if the model
-            is.
+            is "none".
         evidence: the measurements on which the decision rests.
     """
 
@@ -96,15 +101,16 @@ class GuidedMatches:
     """Matches of keypoints of the first image.
 
     Attributes:
-        indices0: (M,) int64 keypoints of the first image, ascending, each once.
+        indices0: (M,) int64 rows of the keypoints of the first image, ascending, each once.
         points1: (M, 2) float64 positions in the second image.
         scores: (M,) float32 in [0, 1], higher is better.
-        subpixel: whether the positions are sub-pixel, from a rectified pair.
-        indices1: (M,) int64 keypoints of the second image; None if the positions are not keypoints.
-        points0: (M, 2) float64 positions in the first image; None if they are keypoints. A match
-            without a keypoint near it then has the index -1.
-        alike: (M,) bool, False if the images contradict a match: the windows of both images, placed
-            by the surrounding matches, are no more similar than unrelated windows.
+        subpixel: whether `points1` are sub-pixel positions, as from a rectified pair.
+        indices1: (M,) int64 rows of the keypoints at `points1`; None if these are no keypoints.
+        points0: (M, 2) float64 positions in the first image, if they are not keypoints; otherwise
+            None. With `points0`, a match without a keypoint near it has -1 in `indices0`.
+        alike: (M,) bool, False if the images contradict a match: the window around it in the first
+            image is no more similar to its place in the second image, as the surrounding matches
+            predict it, than unrelated windows are.
     """
 
     indices0: np.ndarray
@@ -119,11 +125,11 @@ class GuidedMatches:
         return len(self.indices0)
 
     def starts(self, xy0: np.ndarray) -> np.ndarray:
-        """Return the positions in the first image, (M, 2), of keypoints at `xy0`."""
+        """Return the (M, 2) positions in the first image; its keypoints lie at `xy0`."""
         return xy0[self.indices0] if self.points0 is None else self.points0
 
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
-        """Return these matches joined with those of `others` that are `chosen`, (M,) bool."""
+        """Return these matches joined with those of `other` where the mask `chosen` is true."""
         order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")
 
         def both(name: str) -> np.ndarray:
@@ -142,7 +148,7 @@ class _Lazy:
 
     def __get__(self, instance: Any, owner: type | None = None) -> Keypoints:
         if instance is None:
-            raise AttributeError(self.name)  # the field then has no default
+            raise AttributeError(self.name)  # tells `dataclass` that the field has no default
         keypoints = instance.__dict__[self.name]
         if not isinstance(keypoints, Keypoints):
             keypoints = instance.__dict__[self.name] = keypoints()
@@ -164,29 +170,31 @@ class Matches:
 
     Attributes:
         points0, points1: (M, 2) float32 positions in the first and in the second image, matched row
-            by row; centre of the first pixel (0, 0). They are keypoints, unless a fundamental
-            matrix guided: then those of the first image are the pixels of its keypoints, and those
-            of the second where these pixels are seen. With `mutual` it may be the other way round.
-        scores: (M,) float32 in [0, 1], higher is better. If a homography guided: 1 - the
-            dissimilarity of both patches (0: just more similar than unrelated patches); if a
-            fundamental matrix guided: their correlation; otherwise 1 - Lowe's ratio.
+            by row, in pixels; the centre of the first pixel is (0, 0). They are keypoints, unless a
+            fundamental matrix guided the matching. Then `points0` are pixels with keypoints, and
+            `points1` the places where the second image shows these pixels. With `mutual` the two
+            images may have swapped these roles.
+        scores: (M,) float32 in [0, 1], higher is better. If a homography guided the matching, 1 -
+            the dissimilarity of the two patches (at a score of 0, they are just more similar than
+            unrelated patches). If a fundamental matrix guided it, the correlation of the patches.
+            Otherwise, 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
             `GeometryOptions.inlier_threshold`; all matches if there is no geometry yet. Guided
             matches that the surrounding image contradicts are no inliers.
-        keypoints0, keypoints1: all keypoints of the two images. If no geometry was found they may
-            be lazy: they are detected on first access.
-        seconds: time of each stage, for both images together.
+        keypoints0, keypoints1: all keypoints of the two images. If no geometry was found, they may
+            be detected only when they are first accessed.
+        seconds: time of each stage of the matching, for both images together, by the stage's name.
         geometry: the geometry between the images; None for `match_features`, which estimates none.
-        subpixel: whether the matching itself found sub-pixel positions in the second image, by
-            rectification: they need no refinement.
-        indices0, indices1: (M,) int32 rows of `keypoints0` and `keypoints1` that are matched. If a
-            fundamental matrix guided, the first is the keypoint on whose pixel the match lies, and
-            the second the nearest keypoint up to a pixel away, or -1 (`m[m.indices1 >= 0]` drops
-            such matches). With `mutual` it may be the other way round. None: the nearest keypoints
-            are looked up.
+        subpixel: whether the matching itself found sub-pixel positions in the second image, on the
+            rectified pair. They then need no refinement.
+        indices0, indices1: (M,) int32 rows of the matched keypoints in `keypoints0` and
+            `keypoints1`. If a fundamental matrix guided the matching, `indices0` is the keypoint on
+            whose pixel a match starts. `indices1` is the nearest keypoint to its end, up to a pixel
+            away, or -1 (`m[m.indices1 >= 0]` drops matches without one). With `mutual` the two
+            images may have swapped these roles. None: the nearest keypoints are looked up.
 
-    A detector finds the same keypoints in an image whatever it is matched with. So with the same
-    options an index is the same keypoint in all pairs of an image, which allows tracks.
+    The keypoints of an image do not depend on the other image. With the same options, an index is
+    therefore the same keypoint in all pairs with this image, and matches can be joined to tracks.
 
     `len` and indexing by slices, masks, index arrays and whole numbers work: `m[m.inliers]`.
 
@@ -226,7 +234,7 @@ class Matches:
                 f"matches need equally many points0, points1, scores and inliers, not {counts}"
             )
         if not (np.isfinite(self.points0).all() and np.isfinite(self.points1).all()):
-            raise OptionError("matches need finite positions: leave the others out")
+            raise OptionError("matches need finite positions: leave out matches without them")
         for side in (0, 1):
             name = f"indices{side}"
             indices = getattr(self, name)
@@ -240,19 +248,19 @@ class Matches:
             object.__setattr__(self, name, self._checked_indices(indices, side))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled: keypoints, not a function that finds them."""
+        """Return the state to be pickled, which holds keypoints, not a function that finds them."""
         return {**self.__dict__, "keypoints0": self.keypoints0, "keypoints1": self.keypoints1}
 
     @property
     def success(self) -> bool:
-        """False if no geometry can be trusted: its model is "none"."""
+        """False if no geometry between the images can be trusted (its model is "none")."""
         return self.geometry is None or self.geometry.model != "none"
 
     @property
     def pairs(self) -> np.ndarray:
-        """(K, 2) uint32 rows of both images' keypoints, as COLMAP and kornia take matches.
+        """(K, 2) uint32 rows of `keypoints0` and `keypoints1`, as COLMAP and kornia take matches.
 
-        Matches that end at no keypoint are left out.
+        Matches with an end that is no keypoint are left out.
         """
         found = np.column_stack([self.indices0, self.indices1])
         return found[(found >= 0).all(axis=1)].astype(np.uint32)
@@ -261,12 +269,12 @@ class Matches:
     def with_geometry(self, found: Geometry, inlier_threshold: float = 1.0) -> Matches:
         """Return the same matches with a geometry from `estimate_geometry`, and its evidence.
 
-        Its confidence is "fair" if chance does not explain its inliers; otherwise its model is
-        "none" and there are no inliers.
+        The geometry has the confidence "fair" if its inliers are too many to be due to chance.
+        Otherwise it has the model "none", and no match is an inlier.
 
         Args:
             found: the geometry that was estimated from these matches.
-            inlier_threshold: the threshold in the `GeometryOptions`, in pixels.
+            inlier_threshold: the threshold, in pixels, with which the geometry was estimated.
         """
         alarms = np.inf
         if found.matrix is not None:
@@ -284,7 +292,7 @@ class Matches:
     def to_opencv(self) -> list[cv2.DMatch]:
         """Convert to OpenCV's matches of `keypoints0.to_opencv()` and `keypoints1.to_opencv()`.
 
-        Their distances are 1 - score. Matches that end at no keypoint are left out.
+        The distance of a match is 1 - its score. Matches without a keypoint at an end are left out.
 
         Example:
             >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
@@ -297,9 +305,9 @@ class Matches:
         return [cv2.DMatch(i, j, d) for i, j, d in zip(*columns, strict=True) if min(i, j) >= 0]
 
     def unique(self) -> Matches:
-        """Return one-to-one matches: those with the highest score at both of their ends.
+        """Return one-to-one matches: those with the highest score of all matches at both ends.
 
-        An end is a keypoint or, without one, a pixel. Among equal scores the first counts.
+        An end is a keypoint or, without one, a pixel. Among equal scores the first match is kept.
 
         Example:
             >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
@@ -342,20 +350,20 @@ class Matches:
         lines: int = 150,
         by_position: bool = False,
     ) -> np.ndarray:
-        """Draw matches on both images side by side: lines, green for inliers and red for outliers.
+        """Draw matches as lines on both images side by side: inliers in green, outliers in red.
 
         Args:
             image0, image1: arrays, PyTorch tensors or PIL images.
             channels: order of the colours in arrays and tensors.
             lines: maximum number of matches that are drawn: a random sample, always the same.
-            by_position: colour inliers by their position in the first image, and draw more of them
-                as dots than as lines, which shows what was matched where.
+            by_position: colour inliers by their position in the first image, which shows what was
+                matched where. Most inliers are then drawn as dots, without a line.
 
         Returns:
             (H, W, 3) uint8 RGB, its longer side at most 2,000 pixels.
 
         Raises:
-            ImageError: an image has another size than its keypoints'.
+            ImageError: the size of an image differs from the `image_size` of its keypoints.
         """
         from ..viz.draw import draw_matches
         from .display import checked_image
@@ -374,7 +382,7 @@ class Matches:
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: a small table, and the positions of some matches."""
+        """Return HTML for notebooks: a small table, and a figure with some of the matches."""
         from .display import html_summary
 
         inliers, geometry = np.count_nonzero(self.inliers), self.geometry
@@ -396,7 +404,7 @@ class Matches:
         return html_summary(f"{len(self):,} matches", rows, points, lines)
 
     def __repr__(self) -> str:
-        if not self.success:  # its keypoints may not be detected yet
+        if not self.success:  # the keypoints may not be detected yet
             return f"Matches({len(self)} matches; no geometry can be trusted)"
         told = ""
         if self.geometry is not None:
@@ -410,7 +418,7 @@ class Matches:
         """Return the checked indices of an image's keypoints as int32."""
         if indices.shape != (len(self),) or (indices.size and indices.dtype.kind not in "iu"):
             raise OptionError(
-                f"matches need one whole number each in indices{side}, not {indices.dtype} "
+                f"matches need one whole number per match in indices{side}, not {indices.dtype} "
                 f"numbers of shape {indices.shape}"
             )
         if indices.size:
@@ -424,7 +432,10 @@ class Matches:
 
 
 def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Number the end points of matches: keypoints from 0 up, pixels without one from -1 down."""
+    """Return a number for each end of a match, the same for equal ends.
+
+    It is the index of the keypoint or, without one, a negative number for the pixel.
+    """
     ends = indices.astype(np.int64)
     without = np.flatnonzero(indices < 0)
     if len(without):

@@ -1,4 +1,4 @@
-"""Visualisations of keypoints and matches with captions, which the commands write."""
+"""Pictures of keypoints and matches, with captions, as the commands write them."""
 
 from __future__ import annotations
 
@@ -21,22 +21,24 @@ from .selection import spread_over_grid
 
 SHOWN_KEYPOINTS = 1000
 AREA_OF_KEYPOINT_PX = 200
-"""The first is the maximum number of keypoints that are drawn. Small images get one keypoint per
-this area in pixels (the second), so that all can be told apart. Chosen by hand."""
+"""`SHOWN_KEYPOINTS` is the maximum number of keypoints that are drawn. Small images get at most one
+keypoint per `AREA_OF_KEYPOINT_PX` square pixels, so that all can be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
-"""Keypoints use the colour scale from here: darker colours are hard to see. Chosen by hand."""
+"""Keypoints use the colour scale, from 0 to 1, only from this level up, because darker colours are
+hard to see. Chosen by hand."""
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw the best keypoints of all parts of an image, coloured by score or logit, with a scale.
+    """Draw the best keypoints of all parts of an image, with a scale for their colours.
 
-    At most `SHOWN_KEYPOINTS` are drawn: the best of each cell of a grid, then the second-best, and
-    so on. Circles show the sizes of keypoints if known. `fit_picture` reduces the image.
+    The colour is the logit or, without logits, the score. At most `SHOWN_KEYPOINTS` are drawn: the
+    best of each cell of a grid, then the second-best of each, and so on. Circles show the sizes of
+    keypoints if they are known. `fit_picture` scales large images down.
     """
     shown = fit_picture(rgb)
     factor = shown.shape[1] / rgb.shape[1]
-    # Colours stand out on a grey, darker copy.
+    # Colours stand out better on a darkened grey copy of the image.
     gray = cv2.convertScaleAbs(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), alpha=0.6)
     canvas = cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB)
     values = keypoints.scores if keypoints.logits is None else keypoints.logits
@@ -44,7 +46,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     unit = line_scale(canvas)
     room = int(canvas.shape[0] * canvas.shape[1] / (AREA_OF_KEYPOINT_PX * unit**2))
     most = max(1, min(SHOWN_KEYPOINTS, room, len(keypoints)))
-    # More cells than keypoints would leave the parts with the lowest scores empty.
+    # With more cells than drawn keypoints, the parts with the lowest scores would stay empty.
     shorter, longer = sorted(canvas.shape[:2])
     cells = max(1, int((most * longer / shorter) ** 0.5))
     rows = spread_over_grid(keypoints.xy, values, keypoints.image_size, most, cells)
@@ -59,7 +61,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     if keypoints.sizes is not None:
         radii = np.maximum(keypoints.sizes[rows] * factor / 2, 2 * unit)
     centres = scaled_points(keypoints.xy[rows], factor)
-    # The best come last, on top; a dark rim makes them visible on any background.
+    # The best keypoints come last, on top. A dark rim makes circles visible on any background.
     for k in np.argsort(values[rows]):
         draw_circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
         draw_circle(canvas, centres[k], radii[k], colors[k], max(1, round(1.25 * unit)))
@@ -67,7 +69,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
 
 
 def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw all keypoints, with a caption that counts them; `fit_picture` reduces the image."""
+    """Draw all keypoints, scale the picture down if large, and add a caption with their number."""
     caption = f"{_counted(keypoints)}, {keypoints.density:.1%} of the pixels"
     return add_caption(fit_picture(keypoints.draw(rgb)), caption)
 
@@ -82,5 +84,5 @@ def draw_all_matches(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches) -> np
     model = "none" if matches.geometry is None else matches.geometry.model
     caption = f"{len(matches):,} matches ({model}): matching points share a colour"
     if others:
-        caption += f"; {others:,} that do not fit it: red"
+        caption += f"; {others:,} that do not fit the model: red"
     return add_caption(matches.draw(rgb0, rgb1, by_position=True), caption)

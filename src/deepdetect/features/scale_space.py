@@ -9,26 +9,26 @@ import numpy as np
 from .._shared.opencv import cv2
 
 LAYERS = 3
-"""Layers per octave that hold keypoints, as in Lowe (2004): sigma grows by the cube root of 2."""
+"""Layers with keypoints per octave, as in Lowe (2004): each has 2^(1/3) times the sigma before."""
 
 BASE_SIGMA_PX = 1.6
 """Sigma of the blur of the first image of an octave, in the octave's pixels, as in Lowe (2004)."""
 
 CAMERA_SIGMA_PX = 0.5
-"""Sigma of the blur that an image is assumed to have already, in pixels, as in Lowe (2004)."""
+"""Sigma of the blur that the camera is assumed to have caused, in pixels, as in Lowe (2004)."""
 
 SIZE_PER_SIGMA = 2.0
 """The size of a SIFT keypoint in OpenCV is this many times the sigma of its scale."""
 
 MIN_SIDE_PX = 8
-"""Octaves with a side shorter than this are not used. Chosen by hand."""
+"""Octaves whose images have a side shorter than this are not used. Chosen by hand."""
 
 
 def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the octave and the layer, from 1 to 3, whose sigma is nearest to that of keypoints.
+    """Return for each keypoint the octave and the layer, 1 to 3, whose sigma is nearest to its own.
 
-    The (N,) sizes are twice sigma, as in OpenCV's SIFT. `shape` is the (height, width) of the
-    image. Octave -1 is the image enlarged to twice its size.
+    The (N,) sizes are twice the keypoints' sigmas, as in OpenCV's SIFT. `shape` is the image's
+    (height, width). Octave -1 is the image enlarged to twice its size.
     """
     sigma = np.maximum(np.asarray(sizes, np.float64) / SIZE_PER_SIGMA, 1e-6)
     step = np.rint(LAYERS * np.log2(sigma / BASE_SIGMA_PX)).astype(np.int64)
@@ -39,7 +39,7 @@ def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarra
 
 
 def packed_octaves(sizes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return where SIFT describes keypoints of (N,) sizes: octave and layer, packed by OpenCV."""
+    """Return octave and layer of keypoints with (N,) sizes, packed into (N,) int64 as in OpenCV."""
     octaves, layers = nearest_layers(sizes, shape)
     return (octaves & 255) | (layers << 8)
 
@@ -47,9 +47,10 @@ def packed_octaves(sizes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def gaussian_layers(
     gray: np.ndarray, first_octave: int, last_octave: int
 ) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yield the images of the scale space from fine to coarse: octave, layer, (H, W) float32.
+    """Yield the images of the scale space from fine to coarse, as (octave, layer, image).
 
-    The pixel (x, y) of octave o is at (x, y) 2^o of the image. Layers go from 0 to 3.
+    They are (H, W) float32. The pixel (x, y) of octave o lies at (2^o x, 2^o y) in the given image.
+    Layers go from 0 to 3.
     """
     image = gray.astype(np.float32)
     sigma = CAMERA_SIGMA_PX
@@ -73,17 +74,19 @@ def gaussian_layers(
 
 
 WINDOW_PER_SIGMA = 1.5
-"""Sigma of the Gaussian window relative to that of the keypoint, as in Lowe (2004)."""
+"""The gradients that vote for the orientation are weighted by a Gaussian window. Its sigma is this
+many times that of the keypoint, as in Lowe (2004)."""
 
 
 def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the dominant orientation of keypoints as in OpenCV's SIFT, (N,) float32.
 
     The gradients in a Gaussian window of 1.5 sigma around a keypoint, at its scale, vote for 36
-    directions. The histogram is smoothed, and a parabola through its highest bin and both
-    neighbours gives the angle: degrees in [0, 360) from x towards y, which points down; 0 in flat
-    regions. Sizes are diameters, twice sigma. SIFT adds keypoints for directions with nearly as
-    many votes; here only the highest counts.
+    directions. The histogram is smoothed, and a parabola through its highest bin and the two
+    neighbouring bins gives the angle. Angles are in degrees, in [0, 360), from the x axis towards
+    the y axis, which points down; they are 0 in flat regions. Sizes are diameters, twice sigma.
+    SIFT adds further keypoints for directions with nearly as many votes. Here only the direction
+    with the most votes counts.
     """
     from .kernels import strongest_directions
 
@@ -104,7 +107,7 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
 def set_angles(
     gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray, angles: np.ndarray | None
 ) -> np.ndarray:
-    """Return (N,) float32 angles, where unset ones (below 0, or None) are the dominant angles."""
+    """Return (N,) float32 angles, with unset ones (below 0, or None) set to the dominant angles."""
     angles = np.full(len(xy), -1, np.float32) if angles is None else angles.copy()
     unset = np.flatnonzero(angles < 0)
     angles[unset] = dominant_angles(gray, xy[unset], sizes[unset])

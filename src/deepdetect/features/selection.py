@@ -13,28 +13,30 @@ from .._shared.options import numbers_of, suggest_keywords
 from .keypoints import Keypoints, bayer_order
 
 MAX_OFFSET_PX = 0.499
-"""Limit of the sub-pixel offset: below 0.5 the nearest pixel of a keypoint stays the same."""
+"""Sub-pixel refinement moves a keypoint by at most this much in x and in y. As this is below 0.5,
+the nearest pixel of the keypoint stays the same."""
 
 Rows = Callable[[slice], np.ndarray]
 """A function that returns the requested rows of a map."""
 
 BAND_PIXELS = 4_000_000
-"""Maps are processed in bands of about this many pixels, to bound memory."""
+"""Maps are processed in bands of rows with about this many pixels, to limit the memory."""
 
 GRID_CELLS = 24
-"""Number of grid cells along the longer side of the image. The cells give their strongest keypoints
-in turn, so that keypoints cover the image. Chosen by hand."""
+"""Number of grid cells along the longer side of the image. `spread_over_grid` takes the best
+keypoint of each cell before any second-best, so that keypoints cover the image. Chosen by hand."""
 
 DISTANCE_STEP_PX = 0.25
-"""Precision to which `spread_by_distance` finds the distance. Chosen by hand."""
+"""Precision with which `spread_by_distance` finds the largest distance. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class Maps:
     """A heat map and the logits that rank its pixels, each computed on demand.
 
-    Each map of a large image takes more memory than its keypoints, so only one is held at a time.
-    Both are (H, W) float32. `heatmap` computes the map and returns its rows; `logits` the logits.
+    Both maps are (H, W) float32. `heatmap()` computes the heat map, and returns a function that
+    gives its rows. `logits()` computes and returns the logits. Each map of a large image takes more
+    memory than its keypoints, so only one is held at a time.
     """
 
     shape: tuple[int, ...]
@@ -43,15 +45,15 @@ class Maps:
 
     @classmethod
     def of_logits(cls, logits: np.ndarray) -> Maps:
-        """Return maps whose heat map is the sigmoid of the logits and is never held as a whole."""
+        """Return maps with these logits; rows of the heat map are computed from them on demand."""
         return cls(logits.shape, lambda: lambda rows: sigmoid(logits[rows]), lambda: logits)
 
     def both(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the whole heat map and the logits, (H, W) float32 both."""
+        """Return the whole heat map and the logits, (H, W) float32 each."""
         heatmap, rows_of = np.empty(self.shape, np.float32), self.heatmap()
         for rows in bands(self.shape):
             heatmap[rows] = rows_of(rows)
-        del rows_of  # frees the map that it may hold
+        del rows_of  # frees the map that the function may hold
         return heatmap, self.logits()
 
 
@@ -62,7 +64,7 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
 
 
 def bands(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Yield the rows of a map in bands, which bounds the memory for processing them."""
+    """Yield slices of rows that divide a map into bands of about `BAND_PIXELS` pixels."""
     rows = max(1, BAND_PIXELS // max(1, shape[1]))
     for start in range(0, shape[0], rows):
         yield slice(start, min(start + rows, shape[0]))
@@ -81,12 +83,12 @@ class SelectionOptions:
 
     Attributes:
         threshold: pixels with a higher probability become keypoints (paper: tau = 0.5).
-        density: keypoints per pixel, in (0, 1]: the most probable pixels are taken up to this
-            fraction of all, instead of those above the threshold.
+        density: keypoints per pixel, in (0, 1]. If set, the threshold is not used: the most
+            probable pixels are taken, up to this fraction of all pixels.
         max_keypoints: maximum number of keypoints; the most probable ones are kept.
         nms_radius: radius of non-maximum suppression in pixels: a pixel is kept if it ranks highest
             within this distance in x and y; 0 keeps all.
-        subpixel: refine positions to the maximum of a parabola through three pixels in x and in y.
+        subpixel: refine x and y to the maxima of parabolas through three pixels along each axis.
 
     Raises:
         OptionError: a value is out of its range.
@@ -125,13 +127,13 @@ def select_keypoints(
         heatmap: (H, W) float32 probabilities.
         options: which pixels are selected. The order of the steps is: ignore mask, threshold,
             suppression, density or maximum number, sub-pixel refinement.
-        logits: (H, W) float32 logits of the map, which rank the keypoints. Without them the map
-            does, although float32 rounds its highest probabilities to 1. Ties are broken by an
-            order that spreads the keypoints evenly (`bayer_order`).
-        ignore: (H, W) bool or number array, true where keypoints are ignored.
+        logits: (H, W) float32 logits of the heat map, by which pixels are ranked. None: they are
+            ranked by the heat map, although float32 rounds its highest probabilities to 1. Ties are
+            broken by an order that spreads the keypoints evenly (`bayer_order`).
+        ignore: (H, W) array of bool or numbers, true or not 0 where keypoints are ignored.
 
     Returns:
-        Keypoints in row-major order, on pixel centres unless `subpixel`.
+        Keypoints in row-major order, on pixel centres unless `subpixel` is set.
 
     Raises:
         OptionError: the ignore mask or the logits differ from the map in size.
@@ -159,7 +161,7 @@ def select_keypoints(
 def select_from_maps(
     maps: Maps, options: SelectionOptions, ignore: np.ndarray | None = None
 ) -> Keypoints:
-    """Select keypoints as `select_keypoints` does, with the logits as ranks."""
+    """Select keypoints as `select_keypoints` does, from maps that are computed on demand."""
     height, width = maps.shape
     passing = _passing(maps, options, ignore)
     ranking = maps.logits()
@@ -172,7 +174,8 @@ def select_from_maps(
         (rows, slice(end - count, end))
         for rows, end, count in zip(bands(maps.shape), np.cumsum(counts), counts, strict=True)
     ]
-    # One map is held at a time, and unwritten parts of the arrays take no memory.
+    # Only one map is held at a time: first the logits, then the heat map. The parts of `xy` and
+    # `scores` that are not yet written take no memory.
     for rows, part in parts:
         pixels = _unpack(chosen[rows], width)
         logits[part] = ranking[rows].ravel()[pixels]
@@ -193,16 +196,16 @@ def select_from_maps(
 
 
 def _unpack(packed: np.ndarray, width: int) -> np.ndarray:
-    """Return the flat indices of the pixels that are set in packed rows."""
+    """Return the flat indices of the pixels that are set in a bit mask, packed along the rows."""
     return np.flatnonzero(np.unpackbits(packed, axis=1, count=width))
 
 
 def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -> np.ndarray:
-    """Return the pixels above the threshold that are not ignored; a byte holds eight of a row."""
+    """Return a bit mask, packed along the rows, of pixels above the threshold and not ignored."""
     height, width = maps.shape
     if ignore is not None:
         ignore = check_ignore(ignore, maps.shape)
-    # A density may need all pixels except impossible ones.
+    # A density may need all pixels except those with a probability of 0.
     threshold = options.threshold if options.density is None else 0.0
     packed = np.empty((height, -(-width // 8)), np.uint8)
     heatmap = maps.heatmap()
@@ -224,8 +227,8 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
     ranks = ranking.ravel()
 
     def wanted(rows: slice) -> np.ndarray:
-        """Return the pixels of a band that pass everything except the limit on their number."""
-        # Suppression also depends on pixels just outside the band.
+        """Return the flat indices of the pixels of a band that pass and are not suppressed."""
+        # Suppression also depends on the pixels within `radius` outside the band.
         seen = slice(max(0, rows.start - radius), min(height, rows.stop + radius))
         pixels = _unpack(passing[seen], width)
         if radius and len(pixels):
@@ -263,7 +266,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
 
 def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) -> np.floating:
     """Return the `count`-th highest value of all parts; -infinity if there are fewer values."""
-    if count == 0:  # the density is less than half a pixel
+    if count == 0:  # the density asks for less than half a keypoint
         return kind.type(np.inf)
     best = np.empty(0, kind)
     for part in parts:
@@ -281,16 +284,17 @@ def _is_highest(
     first_row: int,
     height: int,
 ) -> np.ndarray:
-    """Return the pixels of a band that rank highest in the window around them.
+    """Return, for each pixel, whether it ranks highest in the square window around it.
 
-    The band starts at `first_row` of an image of this height. Among equal scores the first pixel in
-    `bayer_order` ranks highest, so that one pixel of a plateau is kept.
+    `pixels` are flat indices in a band of this shape, which starts at row `first_row` of an image
+    of this height. Among equal scores the first pixel in `bayer_order` ranks highest, so that one
+    pixel of a plateau is kept.
     """
     kind = np.float32 if scores.dtype == np.float32 else np.float64
     image = np.full(shape, -np.inf, kind)
     image.ravel()[pixels] = np.maximum(scores, np.finfo(kind).min)
     radius = min(radius, max(shape))
-    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # a box is dilated in linear time
+    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # dilation by a square takes linear time
     highest = cv2.dilate(image, window) == image  # outside the border the value is -infinity
     kept = highest.ravel()[pixels]
     rows = np.flatnonzero(kept)
@@ -314,7 +318,8 @@ def _is_highest(
 def peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
     """Fit a parabola through each pixel and its two neighbours; return the offset of its maximum.
 
-    The axis is 0 (down) or 1 (right). The offset is 0 on the border, and where there is no maximum.
+    The neighbours are those in y if the axis is 0, and in x if it is 1. The offset is 0 at the
+    border of the image, and if a neighbour is higher than the pixel.
     """
     position, last = (row, column)[axis], ranking.shape[axis] - 1
     inner = (position > 0) & (position < last)
@@ -333,7 +338,7 @@ def peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: 
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an ignore mask as (H, W) bool; an OptionError if it differs from the image in size."""
+    """Return an ignore mask as (H, W) bool; a size other than the image's raises an OptionError."""
     mask = numbers_of("ignore", ignore, bool)
     if mask.shape != shape:
         raise OptionError(
@@ -352,7 +357,7 @@ def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
 
 
 def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:
-    """Choose a random one of the (N, 2) positions in each grid cell; (K,) rows, ascending."""
+    """Choose one random position in each grid cell; return the chosen rows of `xy`, ascending."""
     cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
     order = np.random.default_rng(seed).permutation(len(cell))
     _, first = np.unique(cell[order], axis=0, return_index=True)
@@ -368,8 +373,8 @@ def spread_over_grid(
 ) -> np.ndarray:
     """Choose keypoints by score, in turn from all cells of a grid.
 
-    Returns at most `max_keypoints` rows: the best of each cell, then the second-best, and so on.
-    There are `grid_cells` cells along the longer side of the image.
+    Returns at most `max_keypoints` rows of `xy`: the best keypoint of each cell, then the
+    second-best of each, and so on. There are `grid_cells` cells along the longer side of the image.
     """
     side = max(image_size) / grid_cells
     cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
@@ -382,13 +387,13 @@ def spread_over_grid(
 
 
 def descending_order(values: np.ndarray) -> np.ndarray:
-    """Return the rows of (N,) numbers from the highest; several times as fast as NumPy for float32.
+    """Return the indices that sort (N,) numbers from the highest to the lowest.
 
-    Among equal numbers the first row comes first.
+    Among equal numbers, the lower index comes first. For float32 this is faster than NumPy.
     """
     if values.dtype != np.float32:
         return np.argsort(-values, kind="stable")
-    # The bits of floats grow with their magnitude, also below 0.
+    # Read as an integer, the bits of a float grow with its magnitude, also for negative floats.
     bits = (values + np.float32(0)).view(np.int32)
     keys = np.where(bits < 0, bits & 0x7FFFFFFF, ~bits).astype(np.int64) << 32
     keys |= np.arange(len(values))
@@ -404,8 +409,9 @@ def suppress_neighbors(
 ) -> np.ndarray:
     """Keep each point, from the best on, unless it is near a kept one; return the kept rows.
 
-    Two points are near if their distance is below the radius or, with (N,) radii, below the smaller
-    one of theirs. Among equal scores the first row comes first. `max_count` limits their number.
+    The rows are ordered best first; among equal scores, the lower row counts as better. Two points
+    are near if their distance is below the radius or, with (N,) radii, below the smaller of their
+    two radii. At most `max_count` points are kept.
     """
     from .kernels import keep_distant
 
@@ -423,7 +429,10 @@ def suppress_neighbors(
 
 
 def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:
-    """Choose the best points that are as far apart as their number allows, best first."""
+    """Choose `count` good points that lie as far apart as possible; return their rows, best first.
+
+    A search finds the largest distance at which suppression still keeps `count` points.
+    """
     best = descending_order(np.asarray(scores))
     if count >= len(best):
         return best

@@ -1,6 +1,6 @@
 """SIFT descriptors of any keypoints (paper, Section III-C), and well-spread SIFT keypoints.
 
-To add a descriptor, add `(gray, xy, size, angle) -> (N, D) uint8 or float32` to `DESCRIPTORS`.
+To add a descriptor, add to `DESCRIPTORS` a function `(gray, xy, size, angle) -> (N, D) array`.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, packed_octaves,
 from .selection import spread_over_grid
 
 ROOT_SIFT: Final = "rootsift"
-"""`Keypoints.descriptor_type` of RootSIFT."""
+"""Value of `Keypoints.descriptor_type` for RootSIFT."""
 
 DENSE_SIZES_PX = (2.0, 8.0)
-"""Range of keypoint diameters that `dense_sift` supports."""
+"""Range of keypoint diameters, in pixels, that `dense_sift` supports."""
 
 MIN_DENSE_DENSITY = 0.02
-"""`dense_sift` is faster than one keypoint at a time above this number of keypoints per pixel."""
+"""`dense_sift` is faster than describing one keypoint at a time if there are more keypoints per
+pixel than this."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
@@ -35,10 +36,10 @@ CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
 0.04. The thresholds apply to the contrast times the number of layers, as in OpenCV."""
 
 MIN_KEYPOINTS = 1000
-"""The next lower contrast threshold is tried if there are fewer keypoints. Chosen by hand."""
+"""If there are fewer keypoints, the next lower contrast threshold is tried. Chosen by hand."""
 
 ROWS_AT_ONCE = 1024
-"""Descriptors are converted in blocks of this many, which stay in the processor's cache."""
+"""This many descriptors are converted to RootSIFT at a time: they stay in the processor's cache."""
 
 
 def sift_descriptors(
@@ -48,8 +49,8 @@ def sift_descriptors(
 
     Many upright keypoints on whole pixels are described by `dense_sift`, whose result differs from
     OpenCV's by 1 in one of ten thousand numbers. Other keypoints are described by OpenCV. The size
-    is a diameter in pixels, the angle is in degrees. OpenCV's SIFT takes the angle -1, which means
-    unset, for a rotation by one degree. The paper's published code does the same.
+    is a diameter in pixels, the angle is in degrees. The angle -1 usually means unset, but OpenCV's
+    SIFT takes it for a rotation by one degree, as in the paper's published code.
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and DENSE_SIZES_PX[0] <= size <= DENSE_SIZES_PX[1]
@@ -69,8 +70,9 @@ def dense_sift(
 
     OpenCV sums the gradients around each keypoint separately. If all keypoints are upright and of
     one size, these sums are a separable filter (bilinear times Gaussian) of the image. Positions
-    are whole pixels inside the image. Positions that lie on every `step_px`-th row and column take
-    less time. The size lies within `DENSE_SIZES_PX`. The gradient comes from `sift_gradient`.
+    must be whole pixels inside the image, and lie only on every `step_px`-th row and column. A step
+    above 1 takes less time. The size must lie within `DENSE_SIZES_PX`. `gradient` is the result of
+    `sift_gradient` for this image; None: it is computed.
     """
     from .kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
@@ -106,14 +108,15 @@ def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of the pixels around a keypoint, and where they are not 0.
+    """Return the weights of the pixels along one axis around a keypoint, and where they are not 0.
 
-    The weights are (4, T) float32, a row per bin. The (4, 3) int64 spans suit `describe_tiles`.
+    The weights, (4, T) float32, have a row for each of the four spatial bins. The second result is
+    the (4, 3) int64 `spans` of `describe_tiles`.
     """
     from .kernels import TAPS_AT_ONCE
 
     width = BIN_WIDTH * size
-    reach = int(np.ceil(2.5 * width)) - 1  # four bins, and half a bin of overlap at each end
+    reach = int(np.ceil(2.5 * width)) - 1  # two bins on each side, and half a bin of overlap
     offsets = np.arange(-reach, reach + 1) / width
     bins = np.arange(4)[:, None] - 1.5
     bilinear = np.maximum(0, 1 - np.abs(offsets - bins))
@@ -144,9 +147,9 @@ def scaled_sift_descriptors(
 ) -> np.ndarray:
     """Compute (N, 128) uint8 SIFT descriptors of keypoints at their own sizes and angles.
 
-    Gradients are taken from the scale-space image nearest to the size, as for SIFT's own keypoints.
-    (`sift_descriptors` uses the finest image for all.) Sizes are diameters, twice sigma: a
-    descriptor covers a square of six times this side.
+    Gradients are taken from the image of the scale space that is nearest to the keypoint's size, as
+    for SIFT's own keypoints. (`sift_descriptors` uses the finest image for all keypoints.) Sizes
+    are diameters, twice sigma. A descriptor covers a square with a side of six diameters.
     """
     if not len(xy):
         return np.empty((0, 128), np.uint8)
@@ -162,21 +165,22 @@ def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) ->
     described, descriptors = sift.compute(gray, keypoints)
     if len(described) != len(keypoints):  # OpenCV would silently change the order of rows
         raise AssertionError("cv2.SIFT left out keypoints that were given to it")
-    return descriptors.astype(np.uint8)  # they are whole numbers from 0 to 255
+    return descriptors.astype(np.uint8)  # OpenCV's floats are whole numbers from 0 to 255
 
 
 def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
     """Return keypoints with RootSIFT descriptors.
 
-    Keypoints with sizes are described at their own sizes and angles, or at the dominant angle if
-    theirs is unset; others upright with size 3, as in the paper.
+    Keypoints with sizes are described at their own sizes and angles; unset angles are replaced by
+    the dominant gradient orientations. Keypoints without sizes are described upright and with a
+    diameter of 3 pixels, as in the paper.
 
     Args:
         gray: (H, W) uint8 luma of the image of the keypoints.
         keypoints: keypoints of any detector; angles of -1 are unset.
 
     Raises:
-        ImageError: the image has another type or size than the keypoints' own.
+        ImageError: the image is not uint8, or has another size than `keypoints.image_size`.
         OptionError: a size is not above 0.
 
     Example:
@@ -188,7 +192,7 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
     if gray.dtype != np.uint8 or gray.shape[::-1] != keypoints.image_size:
         width, height = keypoints.image_size
         raise ImageError(
-            f"keypoints of {width}x{height} pixels need the uint8 luma of their image, of shape "
+            f"keypoints of an image of {width}x{height} pixels need its uint8 luma, of shape "
             f"{(height, width)}, not {gray.dtype} of shape {gray.shape}"
         )
     if keypoints.sizes is None:
@@ -203,7 +207,7 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
 def describe_scaled(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
     """Return keypoints with SIFT descriptors at their own sizes and angles.
 
-    Unset angles become the dominant ones; a size that is not above 0 is an OptionError.
+    Unset angles become the dominant gradient orientations. Sizes not above 0 raise an OptionError.
     """
     xy, sizes = keypoints.xy, keypoints.sizes
     assert sizes is not None
@@ -232,7 +236,7 @@ def to_root_sift(descriptors: np.ndarray) -> np.ndarray:
 
 
 def _square_root(start: int, stop: int, descriptors: np.ndarray) -> None:
-    """Convert the rows from `start` to before `stop` in place."""
+    """Convert the SIFT descriptors `start` to `stop` (exclusive) to RootSIFT, in place."""
     roots = np.sqrt(np.arange(256, dtype=np.float32))
     for first in range(start, stop, ROWS_AT_ONCE):
         rows = descriptors[first : min(first + ROWS_AT_ONCE, stop)]
@@ -250,10 +254,11 @@ def correlation_distance(
     rows1: np.ndarray,
     mean: np.ndarray,
 ) -> np.ndarray:
-    """Return 1 - correlation of pairs of descriptors about a (D,) float32 mean, (K,) float32.
+    """Return 1 - correlation of K pairs of uint8 descriptors, (K,) float32.
 
-    The pairs are (K,) rows of (N, D) and (M, D) uint8 descriptors. The result is 0 for equal
-    descriptors, and 1 if one of them equals the mean.
+    A pair is a row of `first`, (N, D), given in `rows0`, (K,), and a row of `second`, (M, D), given
+    in `rows1`, (K,). `mean`, (D,) float32, is subtracted from all descriptors first. The result is
+    0 for equal descriptors, and 1 if one of them equals the mean.
     """
     from .kernels import correlation_distances
 
@@ -275,11 +280,12 @@ DESCRIPTORS: dict[str, Descriptor] = {
 def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
     """Detect SIFT keypoints, spread over a (H, W) uint8 image, with RootSIFT descriptors.
 
-    They have sizes, angles and octaves; descriptors are rotated to the keypoints' angles.
+    The keypoints have sizes, angles and octaves. Descriptors are rotated to the keypoints' angles.
     """
     size = (gray.shape[1], gray.shape[0])
-    # Detected once, with the lowest threshold: nearly all of the time goes into the pyramid.
-    # Without precise upscaling OpenCV's positions are a quarter of a pixel off, right and down.
+    # SIFT runs once, with the lowest threshold, because nearly all of the time goes into the
+    # pyramid. Higher thresholds are applied below. Without precise upscaling OpenCV's positions
+    # are a quarter of a pixel off, to the right and down.
     sift = cv2.SIFT_create(
         nOctaveLayers=LAYERS,
         contrastThreshold=min(CONTRAST_THRESHOLDS),

@@ -1,4 +1,4 @@
-"""What the backends share: options, and checks of a network's output."""
+"""What all backends share: their options, and checks of a network's output."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ..._shared.options import suggest_keywords
 from ..pretrained import LOGITS
 
 PROBE_SHAPE = (24, 32)
-"""Height and width in pixels of the image that tests a network on loading. Chosen by hand."""
+"""Height and width in pixels of the noise image that tests a loaded network. Chosen by hand."""
 
 
 class Network(Protocol):
     """A loaded network."""
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Map (N, 3, H, W) float32 in [0, 1] to (N, 1, H, W) float32 logits, all finite.
+        """Map images, (N, 3, H, W) float32 in [0, 1], to finite logits, (N, 1, H, W) float32.
 
         H and W are multiples of 8. Lack of memory raises a MemoryError, and an output of a wrong
         shape or type a WeightsError.
@@ -49,15 +49,15 @@ def as_logits(
 ) -> np.ndarray:
     """Check a network's output, and convert it to (N, 1, H, W) float32 logits.
 
-    Probabilities that float32 rounds to 0 or 1 become the logits of the nearest float32 number.
+    Probabilities that float32 rounds to 0 or 1 are clipped, as their logits would be infinite.
     """
     wanted = (image_shape[0], 1, *image_shape[2:])
     if output.shape != wanted or output.dtype != np.float32:
         raise WeightsError(
             f"{path} does not fit: it gives a {output.dtype} map of shape {output.shape} for an "
-            f"image that needs float32 {wanted}; use other weights"
+            f"image whose map must be float32 of shape {wanted}; use other weights"
         )
-    low, high = float(output.min()), float(output.max())  # the sum is NaN if any value is
+    low, high = float(output.min()), float(output.max())  # both are NaN if any value is NaN
     if not (np.isfinite(low) and np.isfinite(high)):
         raise WeightsError(
             f"{path} gives values that are not finite: it is damaged, or its training diverged; "
@@ -82,7 +82,7 @@ def unreadable(path: Path, error: Exception) -> WeightsError:
 
 
 def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
-    """Return the error for a failed run on (N, 3, H, W); a MemoryError for lack of memory."""
+    """Return the error for a failed run on (N, 3, H, W): a MemoryError if memory was short."""
     if any(word in f"{type(error).__name__} {error}" for word in ("MemoryError", "alloc")):
         return MemoryError(str(error))
     height, width = image_shape[2:]
@@ -93,6 +93,6 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
 
 
 def _reason(error: Exception) -> str:
-    """Return the line of a runtime's message with the reason: OpenVINO's begin with file names."""
+    """Return the line with the reason from a runtime's error: OpenVINO's begin with file names."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[-1] if lines[0].startswith("Exception from") else lines[0]

@@ -1,6 +1,6 @@
-"""Cutting a part out of the network in an ONNX file, between named tensors.
+"""Cutting out the part of a network in an ONNX file that lies between named tensors.
 
-Protobuf, which comes with ONNX Runtime, suffices for this, so that the package `onnx` is not needed
+Protobuf, which comes with ONNX Runtime, suffices for this, so the package `onnx` is not needed
 to run a network. Protobuf copies fields that are not declared here unchanged.
 """
 
@@ -24,14 +24,14 @@ FIELDS: dict[str, dict[str, tuple[int, str]]] = {
     "Type": {"array": (1, "Array")},
     "Array": {"element": (1, "int32")},
 }
-"""Numbers and types of the fields in onnx.proto3, by message. All are declared as repeated, because
-a single value is written the same way."""
+"""Numbers and types of the fields in onnx.proto3, by message. All fields are declared as repeated,
+because Protobuf writes a single value in the same way."""
 
 FLOAT = 1
 
 
 def cut_onnx(model: bytes, inputs: Collection[str], outputs: Collection[str]) -> bytes:
-    """Cut out of an ONNX file the part that computes some tensors from others, all float32.
+    """Return the part of an ONNX file that computes `outputs` from `inputs`, all float32 tensors.
 
     A KeyError names a tensor that is missing or cannot be computed from the inputs.
     """
@@ -60,7 +60,7 @@ def cut_onnx(model: bytes, inputs: Collection[str], outputs: Collection[str]) ->
 
 @functools.cache
 def _model_class() -> Any:
-    """Declare `FIELDS` to protobuf."""
+    """Declare `FIELDS` to Protobuf; return the class that reads a whole ONNX file."""
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message_factory import GetMessageClass

@@ -37,22 +37,22 @@ class OnnxRuntimeNetwork:
     def __call__(self, image: np.ndarray) -> np.ndarray:
         try:
             output = self._session.run([self._output_name], {self._input_name: image})[0]
-        except Exception as error:  # its exceptions share no base class
+        except Exception as error:  # ONNX Runtime's exceptions share no base class
             raise failed_run(error, image.shape) from None
         return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
     def release_memory(self) -> None:
-        """Release the memory that is kept between runs."""
+        """Release the memory that the session keeps between runs."""
         settings = import_onnxruntime().RunOptions()
         settings.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         smallest = np.zeros((1, 3, *PROBE_SHAPE), np.float32)
-        # It raises an error if there is no memory of the processor to release.
+        # ONNX Runtime raises an error if it keeps no memory on the CPU.
         with contextlib.suppress(Exception):
             self._session.run([self._output_name], {self._input_name: smallest}, settings)
 
 
 def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
-    """Load an ONNX file; a device that is not available is an OptionError."""
+    """Load an ONNX file; a device that is not available raises an OptionError."""
     onnxruntime = import_onnxruntime()
     device = options.device
     provider = PROVIDERS.get(device, device)
@@ -60,14 +60,14 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
     if provider not in known:
         raise unknown_name("device", device, (*PROVIDERS, *known))
     if provider not in available:
-        build = "onnxruntime-gpu in its place" if device == "cuda" else "the build that has it"
+        build = "onnxruntime-gpu in its place" if device == "cuda" else "a build with this device"
         raise OptionError(
             f"the installed onnxruntime does not have the device {device}: install {build}, or use "
             f"{' or '.join(['cpu', *(name for name in available if name != CPU)])}"
         )
     try:
         session = start_session(_logits_only(path), options.threads, provider)
-    except Exception as error:  # its exceptions share no base class
+    except Exception as error:  # ONNX Runtime's exceptions share no base class
         raise unreadable(path, error) if provider == CPU else _not_started(device, error) from None
     # If a provider cannot start, ONNX Runtime silently continues on the CPU.
     if provider not in session.get_providers():
@@ -78,14 +78,14 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
 def _not_started(device: str, reason: object) -> OptionError:
     return OptionError(
         f"the device {device} could not start ({first_line(reason)}): check its driver "
-        "and libraries, or leave it out"
+        "and libraries, or leave `device` out"
     )
 
 
 def _logits_only(path: Path) -> str | bytes:
-    """Return the content of a file without its keypoints, if it gives any, else its path.
+    """Return an ONNX file reduced to its logits if it also outputs keypoints, otherwise its path.
 
-    ONNX Runtime computes all outputs of a file, requested or not.
+    ONNX Runtime would compute all outputs of a file, even those that are not requested.
     """
     model = path.read_bytes()
     if all(name.encode() in model for name in (LOGITS, *POINTS)):

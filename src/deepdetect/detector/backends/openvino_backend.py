@@ -1,4 +1,4 @@
-"""The backend OpenVINO, an extra: 1.5 times as fast as ONNX Runtime on CPUs."""
+"""The backend OpenVINO, an optional package that is 1.5 times as fast as ONNX Runtime on CPUs."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from .interface import (
 )
 
 COMPILED_LAYERS = 100
-"""Number of compiled layers that OpenVINO caches. The least recently used are dropped. A layer is
-compiled for each image size. OpenVINO's default, 5000, fills 0.5 GB if sizes vary."""
+"""OpenVINO compiles layers for each image size. It caches this many of them, and drops those used
+least recently. OpenVINO's default, 5000, would fill 0.5 GB if image sizes vary."""
 
 
 class OpenVinoNetwork:
     """A network run by OpenVINO on the CPU.
 
-    After a lack of memory, the file is read and compiled again: the old model gives wrong results,
-    and a model compiled again from the same graph crashes.
+    If memory runs out, the next run reads and compiles the file again: the old model would give
+    wrong results, and a model compiled again from the same graph would crash.
     """
 
     def __init__(
@@ -39,38 +39,38 @@ class OpenVinoNetwork:
         self._model = compile_model()
         self._output_name = output_to_read([v.get_any_name() for v in self._model.outputs])
         self._path = path
-        # Tiles are only computed in float32.
+        # A network runs in tiles only in float32. Its parts are then read from `onnx_path`.
         self.onnx_path = path if options.precision == "float32" else None
         self.threads = options.threads
-        self._works = False  # whether it has given a correct result
+        self._works = False  # whether a run has given a correct result
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         try:
             model = self._model
             if model is None:
                 model = self._model = self._compile()
-            request = model.create_infer_request()  # threads may run at once: one image each
+            request = model.create_infer_request()  # one per call, as threads may run at once
             output = request.infer([image], share_inputs=True)[self._output_name]
-        except Exception as error:  # its exceptions share no base class
+        except Exception as error:  # OpenVINO's exceptions share no base class
             self._model = None
             raise failed_run(error, image.shape) from None
         # If memory is short, OpenVINO may also return nothing, or the previous image's map.
         if self._works and output.shape[2:] != image.shape[2:]:
             self._model = None
-            raise MemoryError("OpenVINO gave a map of another size")
+            raise MemoryError("OpenVINO gave a map of another size than the image")
         logits = as_logits(output, self._output_name, image.shape, self._path)
         self._works = True
         return logits
 
     def release_memory(self) -> None:
-        """Release the memory that is kept between runs."""
-        # It fails while another thread runs the model, and is missing in versions before 2025.
+        """Release the memory that the model keeps between runs."""
+        # The method fails while another thread runs the model. Versions before 2025 lack it.
         with contextlib.suppress(Exception):
             self._model.release_memory()
 
 
 def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
-    """Load an ONNX file; a precision that the processor does not support is an OptionError."""
+    """Load an ONNX file; a precision that the processor does not support raises an OptionError."""
     openvino = import_openvino()
     from openvino.frontend import FrontEndManager
 
@@ -80,7 +80,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
             raise OptionError(
                 "this processor has no instructions for bfloat16: leave `precision` out"
             )
-    # The default on newer CPUs is bfloat16, which moves keypoints.
+    # The precision is always set: on newer CPUs the default is bfloat16, which moves keypoints.
     settings: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "bf16" if options.precision == "bfloat16" else "f32",
         "CPU_RUNTIME_CACHE_CAPACITY": COMPILED_LAYERS,
@@ -89,16 +89,16 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         settings["INFERENCE_NUM_THREADS"] = options.threads
 
     def compile_model() -> Any:
-        # The format is named, because guessing tries all formats and prints an error for each.
+        # Without the name of the format OpenVINO tries all formats, and prints an error for each.
         reader = FrontEndManager().load_by_framework("onnx")
         graph = reader.convert(reader.load(str(path)))
         _keep_what_is_read(graph)
-        # A new core, because one that ran out of memory crashes.
+        # Each compilation uses a new core, because one that has run out of memory crashes.
         return openvino.Core().compile_model(graph, "CPU", settings)
 
     try:
         return OpenVinoNetwork(compile_model, path, options)
-    except Exception as error:  # its exceptions share no base class
+    except Exception as error:  # OpenVINO's exceptions share no base class
         raise unreadable(path, error) from None
 
 
@@ -107,9 +107,9 @@ def _keep_what_is_read(graph: Any) -> None:
     unread = names - {LOGITS} if LOGITS in names else set(POINTS)
     for result in graph.get_results():
         own = result.output(0).get_names()
-        if own & unread and LOGITS not in own:  # versions before 2025 give several names to one
+        if own & unread and LOGITS not in own:  # before version 2025, an output may have two names
             graph.remove_result(result)
     for node in graph.get_ordered_ops():
         for value in node.outputs():
             if PADDED_IMAGE in value.get_names():
-                value.replace(graph.input(0))  # a copy would take 12 bytes per pixel
+                value.replace(graph.input(0))  # saves a copy of 12 bytes per pixel

@@ -1,7 +1,7 @@
 """The registry of the backends that can run the network.
 
 To add a backend, write a module in this folder with a function `open_NAME(path, options) ->
-Network`, and add its line here.
+Network`, and add the function to `BACKENDS`.
 """
 
 from __future__ import annotations
@@ -29,21 +29,24 @@ BACKENDS: dict[str, Callable[[Path, RuntimeOptions], Network]] = {
     "onnxruntime": open_onnxruntime,
     "openvino": open_openvino,
 }
-"""The function of each backend that opens a file, by the backend's name, which is also the name of
-its package."""
+"""The functions with which the backends open a file, by the name of the backend, which is also that
+of the Python package that it needs."""
 
 PRECISIONS = ("float32", "bfloat16")
 
 
 def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
-    """Load weights with a suitable backend; return the network and the backend's name, cached."""
+    """Load weights with a suitable backend; return the network and the backend's name.
+
+    Networks are cached, and loaded again if their file has changed.
+    """
     check_name("backend", options.backend, ("auto", *BACKENDS))
     check_name("precision", options.precision, PRECISIONS)
     check_ranges(options, counts=("threads",))
     if path.suffix.lower() != ".onnx":
         raise WeightsError(
             f"{path} is not an ONNX file: convert safetensors by `deepdetect dev average` of "
-            "deepdetect-lab"
+            "the package deepdetect-lab"
         )
     name = options.backend
     if name == "auto":
@@ -55,7 +58,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
         value = getattr(options, option)
         if value != usual and name != needed:
             raise OptionError(
-                f'`{option}="{value}"` needs the backend {needed}, not {name}: leave one out'
+                f'`{option}="{value}"` needs the backend {needed}, not {name}: leave out one'
             )
     require_packages(f"reading {path.name} with the backend {name}", name)
     file = path.stat()
@@ -64,7 +67,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 
 @functools.lru_cache(maxsize=4)
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
-    """Load a file; it is loaded again if its state has changed."""
+    """Load and check a file, and cache the network; a file with a new `state` is loaded again."""
     network = BACKENDS[backend](path, options)
     _check_answer(network, path)
     return network
@@ -72,7 +75,7 @@ def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object
 
 def _check_answer(network: Network, path: Path) -> None:
     """Run a network on a small noise image, to reject unsuitable weights when they are loaded."""
-    # This is noise enough; importing NumPy's generators would take 6 MB.
+    # These numbers are random enough. Importing NumPy's random generators would take 6 MB.
     numbers = np.arange(3 * math.prod(PROBE_SHAPE), dtype=np.uint16) * np.uint16(40503)
     noise = numbers.reshape(1, 3, *PROBE_SHAPE).astype(np.float32) * np.float32(2**-16)
     try:

@@ -1,1 +1,1 @@
-"""ONNX files of the network for other programs: sizes, metadata, keypoints, writing."""
+"""Export of the network as ONNX files for other programs: image size, metadata, keypoints."""

@@ -1,6 +1,7 @@
-"""ONNX files for other programs: for any image size or a fixed one, with or without points.
+"""Export of ONNX files for other programs, for any image size or a fixed one.
 
-Their input is `image`. Their outputs are `probability`, `logits` and the outputs of `add_points`.
+The input of a file is `image`. Its outputs are the network's maps, `probability` and `logits`, and
+the keypoints that `add_points` adds. Either the maps or the keypoints may be left out.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ class OnnxOptions:
     """Options of an exported ONNX file.
 
     Attributes:
-        size: height and width in pixels of a file for this size only, for OpenCV 4 and other
-            runtimes without dynamic shapes. None: any height and width.
-        batch: number of images per run of a file with a size. Without a size any number.
-        maps: include the network's probability and logits of all pixels.
-        max_keypoints: include this many points of all scales; 0 for none, as OpenCV rejects files
-            with points.
+        size: (height, width) in pixels, if the file is to accept images of this size only. OpenCV 4
+            and other runtimes without dynamic shapes need it. None: images of any size.
+        batch: number of images per run, if `size` is set. A file for any size takes any number.
+        maps: include the outputs `probability` and `logits`, the network's maps of all pixels.
+        max_keypoints: also output this many keypoints of all scales, as `PointDetector` finds them.
+            0: none. OpenCV needs 0, because it rejects files with keypoints.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -55,17 +56,19 @@ class OnnxOptions:
 
     def __post_init__(self) -> None:
         if self.size is not None and len(self.size) != 2:
-            raise OptionError(f"`size` must be height and width, not {self.size}")
+            raise OptionError(f"`size` must be (height, width), not {self.size}")
         ranges = {"size": (8, 16384), "batch": (1, 1024), "max_keypoints": (0, 100_000)}
         check_ranges(self, counts=("size", "batch"), between=ranges)
         if self.max_keypoints or not self.maps:
             check_max_keypoints(self.max_keypoints)
         if self.batch > 1 and self.size is None:
-            raise OptionError("`batch` needs `size`: a file for any size takes any batch")
+            raise OptionError(
+                "`batch` needs `size`: a file for any size takes any number of images"
+            )
 
     @property
     def metadata(self) -> dict[str, str]:
-        """The file's metadata on its options."""
+        """These options as metadata of the file."""
         values = dict(ANY_SIZE)
         if self.size is not None:
             height, width = self.size
@@ -82,10 +85,10 @@ def write_onnx(
     *,
     licence: str | None = None,
 ) -> dict[str, str]:
-    """Write weights as an ONNX file for other programs atomically; return its metadata.
+    """Write weights as an ONNX file for other programs, atomically; return the file's metadata.
 
-    The weights are a name, or an ONNX file that this package has written for any size. Without a
-    new licence, the licence of the weights is kept.
+    The weights are the name of bundled ones, or an ONNX file that this package has written for any
+    image size. If `licence` is None, the metadata keep the licence of the weights.
     """
     if Path(path).suffix.lower() != ".onnx":
         raise OptionError(f"the name of an ONNX file ends in .onnx, not {Path(path).name}")
@@ -99,7 +102,10 @@ def write_onnx(
 def write_model(
     model: ModelProto, path: str | Path, options: OnnxOptions, origin: Mapping[str, str]
 ) -> dict[str, str]:
-    """Write a network for any size as `options` demand, with notes on its origin as metadata."""
+    """Adapt a network for any image size to `options`, and write it; return the metadata.
+
+    `origin` tells where the weights come from, and becomes part of the metadata.
+    """
     if options.size is not None:
         fix_size(model, *options.size, options.batch)
     if not options.maps:
@@ -114,12 +120,12 @@ def write_model(
 
 
 def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
-    """Return weights as a network for any size, and notes on their origin."""
+    """Load weights as a network for any image size; also return metadata on their origin."""
     import onnx
 
     try:
         model = onnx.load_model_from_string(path.read_bytes())
-    except Exception as error:  # protobuf's errors, passed on by onnx
+    except Exception as error:  # onnx passes on the errors of Protobuf
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({error}): download it again"
         ) from None
@@ -127,8 +133,8 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
     tensors = [value.name for value in (*model.graph.input, *model.graph.output)]
     if tensors != [IMAGE, PROBABILITY, LOGITS]:
         raise WeightsError(
-            f"{path} is not a network of deepdetect (it has {', '.join(tensors)}): give a file "
-            "that deepdetect has written"
+            f"{path} is not a network of deepdetect (its inputs and outputs are "
+            f"{', '.join(tensors)}): give a file that deepdetect has written"
         )
     found = read_metadata(model)
     if any(found.get(name, value) != value for name, value in ANY_SIZE.items()):

@@ -1,6 +1,6 @@
-"""The graph of an ONNX file: padding and cropping, a fixed size, metadata.
+"""Changes to the graph of an ONNX file: padding and cropping, a fixed image size, metadata.
 
-It needs the package `onnx` but not torch: files are made from files.
+The module needs the package `onnx` but not torch, because it makes files from other ONNX files.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, NodeProto
 
 IMAGE, PROBABILITY, PADDED_LOGITS = "image", "probability", "padded_logits"
-"""Names of tensors; the network itself maps `PADDED_IMAGE` to `PADDED_LOGITS`."""
+"""Names of tensors. The network itself maps `PADDED_IMAGE` to `PADDED_LOGITS`; the other nodes of a
+file pad, crop and compute probabilities."""
 
 _OUTSIDE = {"shape", "sides", "minus_sides", "missing", "padding", PADDED_IMAGE}
 _OUTSIDE |= {"sigmoid", PROBABILITY, LOGITS}
-"""Names of tensors that are computed outside the network itself."""
+"""Names of the tensors that padding, cropping and the sigmoid compute, not the network itself."""
 
 METADATA = {
     "channels": "RGB",
@@ -35,7 +36,7 @@ METADATA = {
 
 
 def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
-    """Give a network with padding one size, and remove the nodes that compute it."""
+    """Fix the batch and image size of a network, and remove the nodes that compute its padding."""
     from onnx import helper
 
     graph = model.graph
@@ -58,7 +59,7 @@ def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
 
     written = {**METADATA, "version": __version__, **values}
     helper.set_model_props(model, dict(sorted(written.items())))
-    # OpenCV 4 averages correctly at the border only with this producer name.
+    # Only in files with this producer name does OpenCV 4 average correctly at the border.
     model.producer_name = "pytorch"
     model.graph.name = "deepdetect"
 
@@ -80,13 +81,16 @@ def ending_nodes(graph: GraphProto, crop: bool = True) -> list[NodeProto]:
     return [
         *([cropping] if crop else []),
         helper.make_node("Sigmoid", [LOGITS], ["sigmoid"]),
-        # Some runtimes approximate the sigmoid by up to 1.0000001.
+        # Some runtimes approximate the sigmoid, which then reaches 1.0000001.
         helper.make_node("Clip", ["sigmoid", "least", "most"], [PROBABILITY]),
     ]
 
 
 def set_sides(graph: GraphProto, kind: str, **sides: str | int) -> None:
-    """Write the batch, height and width of the image and the maps."""
+    """Set the batch, height and width in the shapes of the image and of the maps.
+
+    `kind` is "dim_value" if they are numbers, "dim_param" if they are names.
+    """
     for value in (*graph.input, *graph.output):
         dimensions = value.type.tensor_type.shape.dim
         for axis, name in ((0, "batch"), (2, "height"), (3, "width")):
@@ -94,7 +98,7 @@ def set_sides(graph: GraphProto, kind: str, **sides: str | int) -> None:
 
 
 def replace_nodes(graph: GraphProto, nodes: Sequence[NodeProto]) -> None:
-    """Replace all nodes, and drop the weights that none of them reads."""
+    """Replace all nodes of a graph by `nodes`, and drop the weights that none of these reads."""
     nodes = list(nodes)
     used = {name for node in nodes for name in node.input}
     weights = [one for one in graph.initializer if one.name in used]

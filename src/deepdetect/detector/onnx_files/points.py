@@ -1,6 +1,6 @@
-"""The points of `PointDetector` as outputs of an ONNX file, computed in its graph.
+"""The keypoints of `PointDetector` as outputs of an ONNX file, computed in its graph.
 
-`tools/points_graph.py` makes the graph.
+`tools/points_graph.py` makes the part of the graph that computes them.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 PREFIX = "points/"
-"""Prefix of the names of all tensors in the graph of the points, except for input and outputs."""
+"""The names of all tensors in `POINTS_GRAPH`, except for input and outputs, start with this."""
 
 MAX_KEYPOINTS = f"{PREFIX}max_keypoints"
-"""Name of the initializer that sets the number of points."""
+"""Name of the initializer that sets the maximum number of keypoints."""
 
 
 def add_points(model: ModelProto, max_keypoints: int) -> None:
-    """Let a model with the input `image` also output points.
+    """Let a model with the input `image` also output the keypoints of `PointDetector`.
 
     `keypoints` are (batch, N, 2) float32, x and y in pixels, best first; `scores`, `sizes` and
-    `angles` are (batch, N) float32. If an image has fewer points, the rest is -1, 0, 0 and 0.
+    `angles` are (batch, N) float32. If an image has fewer keypoints, the other rows are -1 in
+    `keypoints` and 0 in the other outputs.
     """
     import onnx
 
@@ -45,7 +46,7 @@ def add_points(model: ModelProto, max_keypoints: int) -> None:
 
 
 def remove_points(model: ModelProto) -> None:
-    """Undo `add_points`."""
+    """Remove the nodes and outputs that `add_points` has added."""
     graph = model.graph
     kept = [value for value in graph.output if value.name not in POINTS]
     nodes = [node for node in graph.node if not node.output[0].startswith((PREFIX, *POINTS))]

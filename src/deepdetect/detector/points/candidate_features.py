@@ -1,7 +1,7 @@
-"""The features of a candidate for the ranker, relative to the candidate's own scale and strength.
+"""Features of candidate keypoints, which are the input of the ranker.
 
-They hardly change if the image is rotated, zoomed or lit differently, so that the ranker ranks the
-same points high in both images of a pair.
+They are measured relative to the candidate's own scale and strength, and hardly change if the image
+is rotated, zoomed or lit differently. So the same points rank high in both images of a pair.
 """
 
 from __future__ import annotations
@@ -12,26 +12,27 @@ from ..._shared.machine import parallel_for
 from .hessian_scales import SIGMAS_PX, VARIANCES, Candidates, ScaleSpace
 
 RING_RADII = (1.0, 2.0, 3.5, 6.0)
-"""Radii of the rings that are sampled around a candidate, in sigmas. Chosen by hand."""
+"""Radii of the rings of samples around a candidate, in sigmas of its scale. Chosen by hand."""
 
 RING_POINTS = 8
-"""Number of points on each ring, at equal angles. Chosen by hand."""
+"""Number of sampled points on each ring, at equal angles. Chosen by hand."""
 
 FEATURES = 23 + 8 * len(RING_RADII)
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
-"""Values added to |det Hessian|, gradients and strengths before logarithms and divisions, so that
-noise and rounding have little effect."""
+"""The three floors are added to |det Hessian|, to squared gradients, and to the strengths by which
+features are divided, so that noise and rounding have little effect on logarithms and quotients."""
 
 
 def ring_offsets() -> np.ndarray:
-    """Return the (2, L, 2, P) int64 offsets of all ring points, in pixels.
+    """Return the offsets, in pixels, from a candidate to its P ring points: (2, L, 2, P) int64.
 
-    The axes are x and y, the level, even or odd column (for y: row) of the candidate, and the
-    points: first the first points of all rings, then the second ones, and so on.
+    The first axis is x or y. The second is the candidate's level. The third tells whether its
+    column (for x) or row (for y) is even or odd. The fourth is the ring point: the first points of
+    all rings, then the second points, and so on.
     """
     angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
     reach = SIGMAS_PX[:, None, None, None] * RING_RADII
-    odd = np.arange(2)[:, None, None]  # halves round to even columns and rows
+    odd = np.arange(2)[:, None, None]  # rounds halves to even columns and rows
     rings = [np.rint(reach * turn(angle) + odd) - odd for turn in (np.cos, np.sin)]
     return np.array(rings, np.int64).reshape(2, len(SIGMAS_PX), 2, -1)
 
@@ -39,11 +40,15 @@ def ring_offsets() -> np.ndarray:
 def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
     """Compute the (N, `FEATURES`) float32 features of candidates.
 
-    The first is the scaled logarithm of |det Hessian|. The others are: the same at neighbouring
-    scales (one level finer, one and two coarser); blob or saddle; trace and gradient at these
-    scales and the candidate's own; its grey value; the largest |det Hessian| nearby at neighbouring
-    scales, relative to its own; mean, maximum and minimum of |det Hessian|, grey value and gradient
-    on rings; its rank divided by the number of pixels; its level.
+    The first is the scaled logarithm of |det Hessian|. The others are, in this order:
+    - |det Hessian| at three neighbouring levels (one finer, two coarser), relative to the first;
+    - the sign of det Hessian, which tells blobs from saddles;
+    - the trace of the Hessian, and then the gradient, at these levels and the candidate's own;
+    - the grey value;
+    - the largest |det Hessian| nearby at the three levels, relative to that at the same pixel;
+    - for each ring, mean, maximum and minimum of |det Hessian| and of the grey value, and mean and
+      maximum of the gradient;
+    - the rank by |det Hessian|, divided by the number of pixels, and the level.
     """
     from .kernels import measure_candidates
 

@@ -1,4 +1,4 @@
-"""The learned descriptor: a network runs on the whole image and is sampled at the keypoints."""
+"""The learned descriptor: a network runs on an image, and its features are sampled at keypoints."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ pixels and `sizes` (1, N), diameters in pixels. Their output is `descriptors` (1
 vectors. All are float32."""
 
 DIGEST_LENGTH = 16
-"""Number of characters of the SHA-256 in the type of a user's own descriptor file."""
+"""The descriptor type of a user's own ONNX file ends with this many characters of its SHA-256."""
 
 STRIDE = 128
-"""The network halves an image seven times, so its sides must be multiples of 128."""
+"""The network halves an image seven times, so the image's sides must be multiples of 128."""
 
 
 def describe_learned(
@@ -48,9 +48,9 @@ def describe_learned(
 ) -> Keypoints:
     """Return keypoints with learned descriptors at their own sizes and angles.
 
-    The image, (H, W) uint8 luma, may be scaled down. Angles that are missing or -1 become dominant
-    angles. The descriptor is a name in `DESCRIPTOR_GRAPHS`, or an ONNX file with the same inputs
-    and output. Keypoints without sizes are an OptionError.
+    `gray` is the (H, W) uint8 luma of the image, possibly scaled down. Angles that are missing or
+    -1 are replaced by the dominant gradient orientations. `descriptor` is a name in
+    `DESCRIPTOR_GRAPHS`, or a similar ONNX file. Keypoints without sizes raise an OptionError.
     """
     kind = descriptor_type(descriptor)
     if not len(keypoints):
@@ -58,7 +58,7 @@ def describe_learned(
         return replace(keypoints, descriptors=none, descriptor_type=kind)
     if keypoints.sizes is None or not (keypoints.sizes > 0).all():
         raise OptionError(
-            "learned descriptors need keypoints with sizes above 0: use points, or RootSIFT"
+            "learned descriptors need sizes above 0: use a PointDetector's keypoints, or RootSIFT"
         )
     height, width = gray.shape
     factor = np.divide((width, height), keypoints.image_size).astype(np.float32)
@@ -79,7 +79,10 @@ def describe_learned(
 
 
 def descriptor_type(descriptor: str | Path) -> str:
-    """Return the `Keypoints.descriptor_type` of a bundled name, or of a file (with its digest)."""
+    """Return the `Keypoints.descriptor_type` of a bundled descriptor, by name, or of an ONNX file.
+
+    The type of a file is "learned-" or "cross-modal-" and the start of its SHA-256.
+    """
     if str(descriptor) in (*DESCRIPTOR_GRAPHS, ROOT_SIFT):
         return str(descriptor)
     path = resolve_weights(descriptor)
@@ -90,15 +93,18 @@ def descriptor_type(descriptor: str | Path) -> str:
 
 @functools.cache
 def _session(path: Path, content: str, threads: int | None) -> Any:
-    """Start the session of a file; it is cached by the file's content and the number of threads."""
+    """Start a session of ONNX Runtime for a file, and cache it.
+
+    `content` is the start of the file's SHA-256: if it changes, the file is loaded again.
+    """
     try:
         session = start_session(str(path), threads)
         names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]
         if names != ["luma", "xy", "sizes", "descriptors"]:
-            raise ValueError("it is not a descriptor")
-    except Exception as error:  # its exceptions share no base class
+            raise ValueError("its inputs and outputs are not those of a descriptor")
+    except Exception as error:  # the exceptions of ONNX Runtime share no base class
         raise WeightsError(
             f"{path} does not describe keypoints ({first_line(error)}): "
-            "use descriptor.onnx of `deepdetect train-descriptor`"
+            "use the descriptor.onnx that `deepdetect train-descriptor` writes"
         ) from None
     return session

@@ -23,29 +23,31 @@ Spread = Literal["none", "grid", "anms"]
 SPREADS = ("none", "grid", "anms")
 
 CANDIDATES_PER_KEYPOINT, MIN_CANDIDATES = 6, 8192
-"""The ranker gets the strongest candidates: the first number per wanted keypoint, and at least the
-second in all. It gets every candidate if all keypoints are wanted, or if they are spread. Half the
-first number would save 7 of 56 ms at 640x480, but cost 0.01 of repeatability at 3 px."""
+"""The ranker gets the candidates with the highest |det Hessian|: `CANDIDATES_PER_KEYPOINT` for each
+wanted keypoint, but at least `MIN_CANDIDATES` in all. If all keypoints are wanted, or if they are
+spread, it gets every candidate. Three candidates per keypoint would save 7 of 56 ms at 640x480, but
+would lower repeatability (within 3 px) by 0.01."""
 
 TILE_PX = 32
-"""Candidates of all scales are processed in tiles of this side, for the cache. Chosen by hand."""
+"""Side of the square image tiles in which candidates of all scales are processed together, so that
+their pixels stay in the processor's cache. Chosen by hand."""
 
 GRID_CELLS = 16
-"""Number of cells along the longer side for the spread "grid". Chosen by hand."""
+"""Number of grid cells along the longer side of the image if `spread` is "grid". Chosen by hand."""
 
 DISTANCE_PX = 2.0
-"""Minimum distance of keypoints. 1.5 and 2.3 px change the ranker's score by less than 0.003."""
+"""Minimum distance of two keypoints. 1.5 or 2.3 px change the ranker's score by less than 0.003."""
 
 DISTANCE_PER_SIGMA = 1.0
-"""Minimum distance of two keypoints relative to the smaller one's sigma, so that one structure is
+"""Minimum distance between two keypoints, in sigmas of the smaller one, so that one structure is
 not found at several scales. It raised the ranker's score on photos/val from 0.539 to 0.543."""
 
 SIZE_PER_SIGMA = 2.5
-"""Diameter of a keypoint for descriptors, relative to the sigma of its scale. Chosen by hand."""
+"""Diameter of a keypoint, for descriptors, divided by the sigma of its scale. Chosen by hand."""
 
 
 def least_distances(sigma_px: np.ndarray) -> np.ndarray:
-    """Return (N,) radii within which a keypoint suppresses keypoints of its size or larger."""
+    """Return, for (N,) sigmas, the minimum distances to keypoints of the same or a larger sigma."""
     radii: np.ndarray = np.maximum(DISTANCE_PX, DISTANCE_PER_SIGMA * sigma_px)
     return radii
 
@@ -60,10 +62,10 @@ def detect_points(
 ) -> Keypoints:
     """Detect keypoints of all scales in a (H, W) uint8 image, best first, as in `PointDetector`.
 
-    The logits are those of the ranker. The scores, in (0, 1) and all different, have the same
-    order.
+    The logits are the outputs of the ranker. The scores are made from them: they lie in (0, 1), all
+    differ, and have the same order.
     """
-    # The strongest candidates alone could not be spread over regions of low contrast.
+    # Spreading needs all candidates: the strongest ones do not lie in regions of low contrast.
     limit = max_keypoints if spread == "none" else None
     strongest = None if limit is None else max(CANDIDATES_PER_KEYPOINT * limit, MIN_CANDIDATES)
     candidates, logits = rank_candidates(gray, strongest, ignore=ignore, ranker=ranker)
@@ -87,7 +89,7 @@ def rank_candidates(
     ignore: np.ndarray | None = None,
     ranker: Ranker | None = None,
 ) -> tuple[Candidates, np.ndarray]:
-    """Return the strongest candidates of a (H, W) uint8 image (None: all), and their logits."""
+    """Return the `strongest` candidates (None: all) of a (H, W) uint8 image, and their logits."""
     height, width = gray.shape
     require_memory(
         f"points of an image of {width}x{height} pixels",
@@ -101,7 +103,7 @@ def rank_candidates(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
     rows = rows[:strongest]
-    # Candidates of all scales in one tile share the processor's cache.
+    # In the order of tiles, candidates of all scales use the same pixels in the cache.
     tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
     candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
     return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))
@@ -110,7 +112,7 @@ def rank_candidates(
 def ranking_scores(logits: np.ndarray) -> np.ndarray:
     """Map (N,) float32 logits in descending order to strictly descending scores in (0, 1).
 
-    If rounding makes two scores equal, the later one gets the next lower number.
+    If rounding makes two scores equal, the later one gets the next lower float32 number.
     """
     tail = 0.5 / (1 + np.abs(logits))
     scores = np.where(logits < 0, tail, 1 - tail).astype(np.float32)
@@ -122,7 +124,7 @@ def ranking_scores(logits: np.ndarray) -> np.ndarray:
 def _choose(
     xy: np.ndarray, logits: np.ndarray, size: tuple[int, int], count: int | None, spread: Spread
 ) -> np.ndarray:
-    """Return the chosen rows of keypoints, which are ordered from best to worst."""
+    """Return the rows of the chosen keypoints; input and result are ordered best first."""
     if count is None or count >= len(xy):
         return np.arange(len(xy))
     if spread == "grid":

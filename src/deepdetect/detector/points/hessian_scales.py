@@ -10,25 +10,26 @@ from ..._shared.opencv import cv2
 from ...features.selection import descending_order, peak_offset
 
 NMS_RADIUS = 2
-"""A candidate is the maximum within this distance in x and y in its level. Chosen by hand."""
+"""A candidate is the maximum of its level within this many pixels in x and y. Chosen by hand."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
-"""Sigmas of the Gaussians of all levels, in pixels: seven levels with candidates, and one finer and
-two coarser ones, which only the ranking uses. Chosen by hand."""
+"""Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Seven levels have
+candidates. The finest and the two coarsest only serve the features for ranking. Chosen by hand."""
 
 VARIANCES = (SIGMAS_PX**2).astype(np.float32)
 """Squares of `SIGMAS_PX`, which normalise the derivatives."""
 
 LEAST_RESPONSE = 1e-8
-"""Minimum response of a candidate, in an image with values in [0, 1]: anything less is rounding."""
+"""Minimum |det Hessian| of a candidate, for grey values in [0, 1]: less is rounding error."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScaleSpace:
-    """Smoothed copies of an image in [0, 1], with derivatives normalised by their scale.
+    """Smoothed copies of an image with values in [0, 1], and the determinants of their Hessians.
 
-    `smooth` and the Hessian's `determinant` are (L, H, W) float32. `gray`, the mean of the image in
-    whole grey levels, is subtracted from `smooth`.
+    `smooth` holds the copies, `determinant` the scale-normalised determinants, (L, H, W) float32
+    each. `gray` is the mean of the image, rounded to a whole grey level (a multiple of 1/255). It
+    has been subtracted from `smooth`.
     """
 
     gray: np.float32
@@ -41,10 +42,10 @@ class Candidates:
     """Maxima of |det Hessian| in each level of a scale space.
 
     Attributes:
-        level, row, column: (N,) int64 pixels.
-        xy: (N, 2) float64 sub-pixel positions.
-        sigma_px: (N,) float64 sigmas of their levels.
-        rank: (N,) int64 ranks by |det Hessian| sigma^4 over the whole image, from 0.
+        level, row, column: (N,) int64 level of the scale space, and pixel in it.
+        xy: (N, 2) float64 sub-pixel positions in the image.
+        sigma_px: (N,) float64 sigmas of the candidates' levels.
+        rank: (N,) int64 ranks by |det Hessian| sigma^4 in all levels; 0 is the strongest.
     """
 
     level: np.ndarray
@@ -58,16 +59,17 @@ class Candidates:
         return len(self.level)
 
     def __getitem__(self, rows: np.ndarray) -> Candidates:
-        """Return the candidates chosen by a mask or by rows."""
+        """Return the candidates chosen by a mask or by row indices."""
         return Candidates(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def build_scale_space(gray: np.ndarray) -> ScaleSpace:
-    """Smooth a (H, W) uint8 image at all scales, and differentiate it."""
+    """Smooth a (H, W) uint8 image with all sigmas, and compute the determinants of the Hessian."""
     from .kernels import differentiate
 
     smooth, determinant = (np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(2))
-    # Values around 0 are rounded least, so other implementations find the same maxima.
+    # Subtracting the mean brings values close to 0, where float32 rounds least. So other
+    # implementations, such as the ONNX graph, find the same maxima.
     mean = np.float32(np.rint(gray.mean()))
     space = ScaleSpace(mean / np.float32(255), smooth, determinant)
     current, reached = (gray - mean) / np.float32(255), 0.0
@@ -82,7 +84,8 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
 def find_candidates(space: ScaleSpace) -> Candidates:
     """Find the maxima of |det Hessian| in each level except the finest and the two coarsest.
 
-    Positions are refined by parabolas in x and y. The outermost rows and columns have no maxima.
+    Positions are refined by parabolas in x and y. No maxima are searched in the outermost
+    rows and columns.
     """
     pixels, positions, strengths = [], [], []
     window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)

@@ -1,4 +1,4 @@
-"""Compiled functions for the detection of points: derivatives and features of candidates.
+"""Compiled functions of `PointDetector`: the Hessian, and the features of candidate keypoints.
 
 Inner loops run over adjacent memory, so that the compiler vectorises them.
 """
@@ -17,9 +17,10 @@ _POINTS = RINGS * RING_POINTS
 
 @compiled(nogil=True, error_model="numpy")
 def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def]
-    """Compute the determinant of the scale-normalised Hessian of a (H, W) float32 image.
+    """Compute the determinant of the scale-normalised Hessian of a smoothed (H, W) float32 image.
 
-    The derivatives are central differences. The image is mirrored at its outermost pixels.
+    `variance` is that of the Gaussian that smoothed it. The derivatives are central differences.
+    Beyond its outermost pixels, the image is mirrored. The result is written into `determinant`.
     """
     height, width = smooth.shape
     scale = variance * variance
@@ -30,7 +31,7 @@ def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def
         above1, above2, here1, here2 = above[1:], above[2:], here[1:], here[2:]
         below1, below2, inner = below[1:], below[2:], out[1:]
         for x in range(width - 2):
-            # This order keeps the differences small, so that little is rounded.
+            # Subtracting in this order keeps values small, and so the rounding errors.
             double = np.float32(2) * here1[x]
             xx, yy = (here[x] - double) + here2[x], (above1[x] - double) + below1[x]
             xy = (below2[x] - below[x]) - (above2[x] - above[x])
@@ -43,7 +44,7 @@ def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def
 
 @compiled(nogil=True, error_model="numpy")
 def _arctangents(values):  # type: ignore[no-untyped-def]
-    """Replace float32 numbers by their arctangents, vectorised (Cephes)."""
+    """Replace float32 numbers by their arctangents, by Cephes's formula in a vectorised loop."""
     for k in range(len(values)):
         x = abs(values[k])
         steep, medium = x > np.float32(2.41421356), x > np.float32(0.41421356)
@@ -64,10 +65,11 @@ def _arctangents(values):  # type: ignore[no-untyped-def]
 def measure_candidates(  # type: ignore[no-untyped-def]
     first, last, shape, smooth, determinant, variances, rings, candidates, floors, features
 ):
-    """Compute the features of some candidates, except those that `describe_candidates` adds.
+    """Write the features of the candidates `first` to `last` (exclusive) into `features`, (N, F).
 
-    The maps of `shape` (L, H, W) are flattened. `rings` are the offsets of `ring_offsets`.
-    `candidates`, (N, 3), holds level, row and column.
+    `describe_candidates` adds rank, level and the mean grey value. `smooth` and `determinant` are
+    flattened maps of `shape` (L, H, W). `rings` comes from `ring_offsets`. The columns of
+    `candidates`, (N, 3), are level, row and column.
     """
     levels, height, width = shape
     floor, slope_floor, strength_floor = floors
@@ -75,7 +77,8 @@ def measure_candidates(  # type: ignore[no-untyped-def]
     steps, values = np.empty((3, _POINTS), np.int64), np.empty((3, _POINTS), np.float32)
     places, right, down = steps[0], steps[1], steps[2]
     response, slope, light = values[0], values[1], values[2]
-    # Order: the candidate, three neighbouring scales, their maxima, four gradients, rings.
+    # `logs` holds, in this order: |det Hessian| of the candidate, then at three neighbouring
+    # scales, its maxima there, the squared gradients at four scales, and values of the rings.
     logs, bent = np.empty(11 + 7 * RINGS, np.float32), np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
         level, row, column = candidates[n, 0], candidates[n, 1], candidates[n, 2]
@@ -108,7 +111,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
             y = row + rings[1, level, row & 1, k]
             x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
             places[k] = start + y * width + x
-            # The gradient across the border is 0.
+            # On the image border, the gradient across the border is 0.
             right[k] = 1 if 0 < x < width - 1 else 0
             down[k] = width if 0 < y < height - 1 else 0
         for k in range(_POINTS):
@@ -133,7 +136,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
             bent[4 + k] = total / np.float32(RING_POINTS) / strength * half
             bent[4 + RINGS + k] = brightest / strength * half
             bent[4 + 2 * RINGS + k] = darkest / strength * half
-        # The sum of four logarithms is that of the product, which is no less than 1e-28.
+        # One logarithm of a product replaces four. The product is at least 1e-28, never 0.
         for k in range(2 * RINGS):
             product, slopes = np.float32(1), np.float32(1)
             for j in range(k, _POINTS, 2 * RINGS):

@@ -1,4 +1,4 @@
-"""The ranker: a small network that orders candidates by how likely they are to be found again."""
+"""The ranker: a small network that orders candidates by how likely another image shows them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ MAX_DEVIATIONS = 6.0
 """Features are clipped at this many standard deviations from their mean. Chosen by hand."""
 
 _CHUNK = 2048
-"""Candidates are ranked in chunks of this many, whose features stay in the processor's cache."""
+"""This many candidates are ranked at a time: their features stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ranker:
-    """Weights of the ranker: a logit is the first feature plus the output of a perceptron of all.
+    """Weights of the ranker, a multilayer perceptron whose input is the features of a candidate.
 
-    Features are normalised by their mean and standard deviation. Each layer has weights (outputs,
-    inputs) and biases, with ReLU between the layers.
+    The logit of a candidate is its first feature plus the output of the perceptron. `mean` and
+    `deviation` normalise the features first. Each of the `layers` has weights (outputs, inputs) and
+    biases, with ReLU between the layers.
     """
 
     mean: np.ndarray
@@ -50,7 +51,7 @@ class Ranker:
 
 
 def load_ranker(path: Path = RANKER) -> Ranker:
-    """Load an npz file that `deepdetect dev train-points` has written."""
+    """Load a ranker from an npz file that `deepdetect dev train-points` has written."""
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
     try:
@@ -61,7 +62,7 @@ def load_ranker(path: Path = RANKER) -> Ranker:
                 (file[f"weight{k}"].astype(np.float32), file[f"bias{k}"].astype(np.float32))
                 for k in range(3)
             )
-    except Exception as error:  # NumPy's readers raise many types
+    except Exception as error:  # NumPy's readers raise many types of exceptions
         raise WeightsError(
             f"{path} does not hold weights of the ranker ({first_line(error)})"
         ) from None
@@ -73,5 +74,7 @@ def load_ranker(path: Path = RANKER) -> Ranker:
         and all(np.isfinite(each).all() for each in (mean, deviation, *itertools.chain(*layers)))
     )
     if not fits:
-        raise WeightsError(f"{path} holds another network than the ranker: use other weights")
+        raise WeightsError(
+            f"{path} holds weights of a network other than the ranker: use other weights"
+        )
     return Ranker(mean, deviation, layers, notes)
