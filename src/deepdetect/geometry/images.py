@@ -104,8 +104,8 @@ def local_zncc(
     """Compute the zero-mean normalised cross-correlation (ZNCC) of windows at the same positions.
 
     The images are divided into squares of `step_px` pixels, and one window is centred on each. Its
-    side `window_px` must be an odd multiple of `step_px`. Returns (H // step_px, W // step_px) float32
-    in [-1, 1], NaN for windows that are flat or not wholly within `valid_mask`.
+    side `window_px` must be an odd multiple of `step_px`. Returns an array (H // step_px,
+    W // step_px) float32 in [-1, 1], NaN for windows that are flat or partly outside `valid_mask`.
     """
     side = window_px // step_px
     shape = (first.shape[0] // step_px, first.shape[1] // step_px)

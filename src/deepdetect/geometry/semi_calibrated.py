@@ -130,7 +130,7 @@ def refine_fundamental(
     sizes: tuple[Size, Size],
     match_sigmas_px: np.ndarray,
 ) -> np.ndarray:
-    """Refine a fundamental matrix by (M, 2) matches, most of them correct, and a prior on the cameras.
+    """Refine a fundamental matrix by matches, most of them correct, and a prior on the cameras.
 
     The prior decides what the matches hardly determine, such as the focal length, or the epipolar
     lines near the image borders. `match_sigmas_px` are the (M,) expected standard deviations of the
