@@ -47,7 +47,7 @@ MIN_BASELINE_MM = 10.0
 number is smaller than this, else in mm. Chosen by hand."""
 
 COLMAP_CENTRE = 0.5
-"""In COLMAP the centre of the first pixel has this x and y. In this package they are 0."""
+"""The centre of the first pixel has this x and y in COLMAP. In this package they are 0."""
 
 NUMBERS = r"([-+.\deE \t;,\[\]]+)\r?$"
 COLMAP_LINE = re.compile(rf"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]{NUMBERS}", re.MULTILINE)

@@ -33,8 +33,8 @@ from .images import (
 from .transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
-"""For each round: side of the tracked windows in pixels, maximum number of corners, and number of
-pyramid levels. In the first round corners move farther, and half as many are enough. Chosen by
+"""Each round has a side of the tracked windows in pixels, a maximum number of corners, and a number
+of pyramid levels. In the first round corners move farther, and half as many are enough. Chosen by
 hand."""
 
 MIN_TRACKS = 15
@@ -50,13 +50,13 @@ MAX_ROUND_TRIP_PX = 0.3
 distance from its start. Chosen by hand."""
 
 CAUCHY_SCALE_PX = 1.0
-"""In a fit, a track with this residual has half the weight of a track without residual. Chosen by
+"""A track with this residual has, in a fit, half the weight of a track without residual. Chosen by
 hand."""
 
 IRLS_ITERATIONS = 30
 
 ALIGNMENT_SIDE_PX = 480
-"""Before all pixels are aligned, images are reduced so that their longer side has at most this many
+"""The images whose pixels are aligned are reduced until their longer side has at most this many
 pixels. Chosen by hand."""
 
 ALIGNMENT_SIGMA_PX = 1.0

@@ -11,8 +11,8 @@ from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
 ANTIALIASING_SIGMA = 0.5
-"""Before an image is sampled at a `scale` below 1, it is blurred with a sigma of this value times
-sqrt(1 / scale^2 - 1) pixels. Chosen by hand."""
+"""An image that will be sampled at a `scale` below 1 is first blurred with a sigma of this value
+times sqrt(1 / scale^2 - 1) pixels. Chosen by hand."""
 
 WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25

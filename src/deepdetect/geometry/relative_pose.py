@@ -23,7 +23,7 @@ MAX_ITERATIONS = 10
 """Gauss-Newton stops after this many steps. Chosen by hand."""
 
 DERIVATIVE_STEP = 1e-6
-"""To compute numerical derivatives, each parameter of the pose is varied by this angle, in
+"""Numerical derivatives are computed by varying each parameter of the pose by this angle, in
 radians."""
 
 MIN_CHANGE = 1e-9
@@ -31,8 +31,8 @@ MIN_CHANGE = 1e-9
 radians."""
 
 MAX_REFITS = 4
-"""After RANSAC, the pose is fitted to its inliers, which are then determined again. This is done at
-most this many times. Chosen by hand."""
+"""The pose that RANSAC finds is fitted to its inliers, which are then determined again. This is
+done at most this many times. Chosen by hand."""
 
 MIN_INLIER_GAIN = 0.01
 """The pose is fitted again only if the previous fit raised the number of inliers by more than this

@@ -15,7 +15,7 @@ from .._shared.opencv import cv2
 from .camera import cross_matrix
 
 MIN_POINTS = 3
-"""At least this number of points must agree, because a similarity needs three points."""
+"""The fit fails if fewer points than this agree, because a similarity needs three points."""
 
 MAX_SAMPLES = 500
 """The search tries this number of random triples of points and, if the upward direction is known,

@@ -76,8 +76,8 @@ MAX_BEHIND_FRACTION = 0.25
 Chosen by hand."""
 
 MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
-"""A rotation explains a disparity if its error is below MAX_ROTATION_ERROR_PX. A pair is rejected as
-a pure rotation only if the best rotation explains more than MIN_ROTATION_FRACTION of its
+"""A rotation explains a disparity if its error is below MAX_ROTATION_ERROR_PX. A pair is rejected
+as a pure rotation only if the best rotation explains more than MIN_ROTATION_FRACTION of its
 disparities. For four views that were rotated by 0.5 to 2 degrees, the fraction was 0.64 or more."""
 
 MAX_RATIO_TO_PLANE = 0.5
@@ -92,9 +92,9 @@ distance by which it moves points off their rows is above this."""
 ROBUST_ITERATIONS = 12
 
 ROTATION_GRID_SIZE_PX, MIN_ROTATION_MATCHES, MAX_ROTATION_SAMPLES = 16, 30, 50_000
-"""A rotation is fitted to one disparity from each cell with the side ROTATION_GRID_SIZE_PX, if there
-are at least MIN_ROTATION_MATCHES cells with one. If there are more than MAX_ROTATION_SAMPLES
-disparities, a random sample of that number is used. Chosen by hand."""
+"""A rotation is fitted to one disparity from each cell with the side ROTATION_GRID_SIZE_PX, if this
+gives at least MIN_ROTATION_MATCHES disparities. Before that, if there are more disparities than
+MAX_ROTATION_SAMPLES, a random sample of that number is taken. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def _coarse_pass(
         gray0, gray1, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
     )
     scale, size = coarse.scales[0], coarse.views[0].shape[::-1]
-    # A distance of 1 px in the copies is more at full size, so the limit for rows is generous here.
+    # A distance of 1 px in the copies is more at full size, so the limit for rows is generous.
     found = detect_rectification(*coarse.matched, size, offset_px * scale, seed)
     if found.by_fundamental < MIN_COARSE_INLIERS:
         return None
@@ -179,7 +179,7 @@ def _coarse_pass(
 
 
 def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
-    """Return by how many pixels the rows of a pair that looks rectified are off, as a high quantile.
+    """Return how many pixels the rows of a pair that looks rectified are off, as a high quantile.
 
     A single match is too inaccurate to tell by how much rows are off at its position. Therefore a
     smooth function is fitted to the distances of all matches from their rows, and its values are

@@ -23,7 +23,7 @@ SCALE = {
     "calib.json)",
 }
 
-SHAPE = "; if cx of the two cameras differs, depths are distorted unless disparity_offset_px is given"
+SHAPE = "; if the cameras differ in cx, depths are wrong unless disparity_offset_px is given"
 """This warning is for a rectified pair whose calibration does not state the disparity offset."""
 
 
@@ -93,7 +93,7 @@ class Reconstruction:
 
     @property
     def baseline_vector(self) -> np.ndarray:
-        """Vector from the left to the right camera centre, (3,) float64, in the points' frame."""
+        """Vector from the left to the right camera centre, (3,) float64, in the left frame."""
         length = 1.0 if self.calibration.baseline_mm is None else self.calibration.baseline_mm
         if self.pose is None:
             return np.array([length, 0, 0])
@@ -123,7 +123,7 @@ class Reconstruction:
         return self._map(self.matched.astype(np.float32)) == 1
 
     def summary(self) -> dict[str, Any]:
-        """Return the result as plain values for JSON, with statistics of arrays; NaN becomes None."""
+        """Return plain values for JSON, with statistics of the arrays; NaN becomes None."""
         errors, disparity = self.reprojection_errors, self.disparity
         rows, pose, calibration = self.rectification, self.pose, self.calibration
         cameras = {"left": calibration.camera0, "right": calibration.camera1}

@@ -1,4 +1,4 @@
-"""Refine matches to sub-pixel accuracy by aligning the patch around each point to the second image.
+"""Refine matches to sub-pixel accuracy: align the patch around each point to the second image.
 
 The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004), and
 independent of the gain and offset of the brightness. Each patch is aligned twice. First it is
@@ -16,8 +16,8 @@ from .._shared.opencv import cv2
 from ..geometry.images import window_sums
 
 PATCH_RADIUS_PX = 4
-"""The side of a patch is 2 * radius + 1 pixels, and its pixels have Gaussian weights with a sigma of
-radius / 2. Chosen by hand."""
+"""The side of a patch is 2 * radius + 1 pixels, and its pixels have Gaussian weights with a sigma
+of radius / 2. Chosen by hand."""
 
 MAX_ITERATIONS = 15
 """Each of the two alignments of a patch takes at most this number of steps. Chosen by hand."""
@@ -26,18 +26,18 @@ MAX_SHIFT_PX = 2.0
 """A match may move by at most this distance in each of the two alignments. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
-"""A match has converged only if the correlation of its patches is at least this after the last step.
-Chosen by hand."""
+"""A match has converged only if the correlation of its patches is at least this in the last
+step. Chosen by hand."""
 
 CONVERGENCE_PX, COARSE_CONVERGENCE_PX = 0.01, 0.05
-"""The first alignment ends at a step shorter than COARSE_CONVERGENCE_PX, because it only prepares the
-second. The second ends at a step shorter than CONVERGENCE_PX."""
+"""The first alignment ends at a step shorter than COARSE_CONVERGENCE_PX, because it only prepares
+the second. The second ends at a step shorter than CONVERGENCE_PX."""
 
 AFFINITY_WINDOW_PX = 15
 """The affinity of a patch is fitted to the matches in a window with this side. Chosen by hand."""
 
 AFFINITY_REGULARIZATION = 20.0
-"""In the fit of an affinity, the similarity of all matches has the weight of this number of matches
+"""The fit of an affinity gives the similarity of all matches the weight of this number of matches
 that fill the window. If there are few matches, or all lie on one line, the affinity is therefore
 close to the similarity. Chosen by hand."""
 
@@ -45,7 +45,7 @@ MAX_SIMILARITY_SAMPLES = 5000
 """The similarity is estimated from at most this number of matches, to save time."""
 
 CORNER_WINDOW_PX = 7
-"""The strength of a corner is measured in a window with this side, which is about that of a patch."""
+"""The strength of a corner is measured in a window with this side, about that of a patch."""
 
 
 def refine_matches(
@@ -90,7 +90,10 @@ def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarr
 
 
 def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """Fit a similarity to matches robustly; return its rotation times its scale, (2, 2) float64."""
+    """Fit a similarity from the first image to the second robustly to matches.
+
+    Returns its rotation times its scale, (2, 2) float64.
+    """
     every = -(-len(points0) // MAX_SIMILARITY_SAMPLES)
     first, second = (
         np.ascontiguousarray(points[::every], np.float64) for points in (points0, points1)
