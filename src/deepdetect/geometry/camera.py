@@ -7,7 +7,7 @@ Focal lengths and positions are in pixels, and the centre of the first pixel is 
      "cx": 231.0, "cy": 184.5,      principal point; default: the middle of the image
      "width": 463, "height": 370,   size of the images; if missing, it is not checked
      "baseline_mm": 160.0,          distance between the cameras; default: unknown
-     "disparity_offset_px": 66.7,   cx of the right camera minus cx of the left; default: from cx
+     "disparity_offset_px": 66.7,   cx right minus cx left; default: computed from the values of cx
      "left": {...}, "right": {...}} values for one view only: focal_px, cx, cy, width, height
 
 Without `baseline_mm`, lengths are in multiples of the baseline. Other keys are ignored. In the
@@ -32,8 +32,8 @@ from .transforms import outer_corners
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
-"""If a camera file states both, its disparity offset may differ from cx of the right camera minus
-cx of the left by at most this. Chosen by hand."""
+"""A camera file may state the disparity offset as well as cx of the two cameras. The offset may
+then differ from cx of the right camera minus cx of the left by at most this. Chosen by hand."""
 
 
 @suggest_keywords
@@ -94,7 +94,7 @@ class Camera:
         return Camera(size, (ratio * self.focal_px).tolist(), centre.tolist())
 
     def rays(self, points: np.ndarray) -> np.ndarray:
-        """Return the rays (x, y, 1) through (N, 2) positions in pixels: (N, 3), camera's frame."""
+        """Return the (N, 3) rays (x, y, 1) through (N, 2) pixels, in the camera's frame."""
         points = numbers_of("points", points, np.float64, 2)
         directions = np.ones((len(points), 3))
         directions[:, :2] = (points - self.centre) / self.focal_px
@@ -148,7 +148,7 @@ class Calibration:
 
     @property
     def disparity_offset_px(self) -> float:
-        """The difference cx right minus cx left, which `depth_mm` adds to each disparity."""
+        """The offset cx right minus cx left in pixels, which `depth_mm` adds to each disparity."""
         return self.camera1.centre[0] - self.camera0.centre[0]
 
     def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
@@ -354,9 +354,12 @@ class PosedView:
 
 
 def camera_spacing(centres: np.ndarray) -> float:
-    """Return the median of the distances from each (V, 3) camera centre to its nearest other."""
+    """Return the median, over all cameras, of the distance to the nearest other camera.
+
+    The centres of the cameras are (V, 3).
+    """
     blocks = np.array_split(centres, len(centres) // 500 + 1)  # the blocks bound the memory
     distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
-    second = min(1, len(centres) - 1)  # the nearest centre is that of the camera itself
+    second = min(1, len(centres) - 1)  # index 0 is the camera itself
     nearest = [np.partition(each, second, axis=1)[:, second] for each in distances]
     return float(np.median(np.concatenate(nearest)))

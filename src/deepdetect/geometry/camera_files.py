@@ -127,7 +127,10 @@ def _xml_values(node: ElementTree.Element) -> Any:
 
 
 def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | None:
-    """Return the value of the first key that has one of the `sizes`, as three rows, or None."""
+    """Return the first value under `keys` that has one of the numbers of elements `sizes`.
+
+    It is reshaped to three rows. None if there is no such value.
+    """
     for key in keys:
         value = values.get(key)
         data = value.get("data") if isinstance(value, Mapping) else value
@@ -204,7 +207,9 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
     if not cameras:
         return None
     if len(cameras) > 2:
-        raise ReconstructionError(f"it has {len(cameras)} cameras: keep only left and right")
+        raise ReconstructionError(
+            f"it has {len(cameras)} cameras: keep only the left and the right one"
+        )
     made = []
     for model, (width, height, *numbers) in cameras:
         _check_distortion(0, model)

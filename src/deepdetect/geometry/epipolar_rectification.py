@@ -71,7 +71,7 @@ class PlanarFrame:
         matrix = self.homographies[view]
         whole = np.full(image.shape[:2], 255, np.uint8)
         shown = cv2.warpPerspective(whole, matrix, self.size, flags=cv2.INTER_NEAREST) > 0
-        # The sign makes the last coordinate below positive on the visible side of the horizon.
+        # This sign makes `inverse[2] @ (x, y, 1)` positive on the visible side of the horizon.
         inverse = np.linalg.inv(matrix) * np.linalg.det(matrix)
         x, y = (np.arange(length) for length in self.size)
         shown &= inverse[2, 0] * x + inverse[2, 1] * y[:, None] + inverse[2, 2] > 0
@@ -103,7 +103,7 @@ class PolarFrame:
     plane: np.ndarray | None = None
 
     def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
-        """Map (N, 2) positions of a view to the frame; the epipole becomes infinite."""
+        """Map (N, 2) positions of a view to the frame; the epipole is mapped to infinity."""
         if view and self.plane is not None:
             points = transform_points(points, np.linalg.inv(self.plane))
         offset = np.asarray(points, np.float64).reshape(-1, 2) - self.epipoles[view]
@@ -134,7 +134,7 @@ class PolarFrame:
         return cv2.remap(image, places, None, cv2.INTER_LANCZOS4, borderMode=border), shown
 
     def _positions(self, column: np.ndarray, row: np.ndarray, view: int) -> np.ndarray:
-        """Map columns and rows of the frame, broadcast together, to a view; return (..., 2)."""
+        """Map columns and rows of the frame, broadcast together, to (..., 2) view positions."""
         angles = self.middle + self.first_angle + row * self.step
         directions = self._directions(angles.ravel(), view).reshape(*row.shape, 2)
         radius = self.min_radius_px * np.exp(column * self.step)
@@ -169,7 +169,8 @@ def rectified_frame(
     The frame is planar if that distorts the views little, otherwise polar. The result is None if
     neither is possible or there are fewer than eight matches. Sizes are (width, height). `plane`
     may be the homography of a plane in the scene, from the first view to the second. It is used to
-    warp the second view to the first before the rectification, so that the plane is not slanted.
+    warp the second view to the first before the rectification, so that the plane does not look
+    slanted.
     """
     if plane is not None:
         shown = transform_points(points1, np.linalg.inv(plane))

@@ -56,8 +56,9 @@ MAX_MATCHES = 2000
 hand."""
 
 SAMPLES = 1000
-"""Number of candidate epipoles. Each is the intersection of the lines of two matches, which are
-drawn at random. Chosen by hand."""
+"""Number of candidate epipoles. Two matches are drawn at random for each candidate. Each match
+gives the line through its predicted and its actual position, and the two lines intersect in the
+candidate. Chosen by hand."""
 
 
 @suggest_keywords
@@ -227,7 +228,7 @@ def estimate_geometry(
 
 
 def check_model(model: str, seed: int, options: GeometryOptions) -> None:
-    """Raise an OptionError if `estimate_geometry` would do so whatever the matches are."""
+    """Raise an OptionError if the model, the seed or the options for it are not valid."""
     check_name("model", model, MODEL_NAMES)
     check_seed(seed)
     if model == "essential":
@@ -397,9 +398,9 @@ class TwoViewModel(Geometry):
 def measure_parallax(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, seed: int = 0
 ) -> Parallax:
-    """Find the epipole on which most of the matches agree that a homography does not explain.
+    """Take the matches that a homography does not explain; find the epipole on which most agree.
 
-    The positions `points0` and `points1` are (M, 2).
+    `points0` and `points1` are the (M, 2) positions of all matches.
     """
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX

@@ -50,8 +50,8 @@ MAX_ROUND_TRIP_PX = 0.3
 distance from its start. Chosen by hand."""
 
 CAUCHY_SCALE_PX = 1.0
-"""A track with this residual has, in a fit, half the weight of a track without residual. Chosen by
-hand."""
+"""A track with this residual has half the weight of a track without residual when a homography is
+fitted. Chosen by hand."""
 
 IRLS_ITERATIONS = 30
 
@@ -78,9 +78,9 @@ returns None if the fit fails."""
 def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Refine the homography from the first of two grey images to the second.
 
-    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. The module
-    tells how each step is validated. If no step improves the homography, it is returned unchanged
-    except for its scale: the last element of the result is always 1.
+    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. The
+    docstring of the module tells how each step is validated. If no step improves the homography, it
+    is returned unchanged except for its scale: the last element of the result is always 1.
     """
     size = (gray0.shape[1], gray0.shape[0])
     blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)
@@ -111,7 +111,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         np.copyto(mixed_mask, other_mask, where=half)
         gain = correlation(mixed, mixed_mask) - correlation(warped, valid_mask)
         # The number of windows that improve is compared with the number that get worse. The mean
-        # correlation would also rise if a plane became worse in favour of objects off the plane.
+        # correlation would also rise for a compromise between a plane and objects off the plane.
         gain = gain[inner & np.isfinite(gain)]
         correction = fit(valid_mask) if np.sign(gain).sum() > 0 else None
         if correction is not None:

@@ -73,8 +73,8 @@ def warp_bands(
 ) -> np.ndarray:
     """Warp an image of C bands, (H, W, C) of any type of number, as `warp_to_reference` does.
 
-    A pixel has no data if any of its bands has the value `no_data`. Pixels of the result have the
-    value `no_data` if they depend on such a pixel or lie outside the image; 0 if it is None.
+    A pixel has no data if any of its bands has the value `no_data`. Pixels of the result that
+    depend on such a pixel, or lie outside the image, become `no_data`, or 0 if it is None.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:
@@ -156,7 +156,7 @@ def gaussian_blur(gray: np.ndarray, sigma_px: float) -> np.ndarray:
 
 
 def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
-    """Remove pixels from an (H, W) mask that a blur mixes with pixels outside the mask."""
+    """Shrink an (H, W) bool mask by the pixels that a blur mixes with pixels outside the mask."""
     return _erode(mask, 2 * int(np.ceil(3 * blur_sigma_px)) + 1)
 
 
@@ -247,8 +247,8 @@ def track_round_trip(
     a point can move. A track has converged when an iteration moves it by less than `step_px`.
 
     The search in the second image begins at the (N, 2) positions `expected`, by default at
-    `points`. The search back begins at the position just found; with `expected` it is moved back by
-    the expected motion, and with `back_to_start` alone it begins at `points`.
+    `points`. The search back begins at the position just found, or at `points` if `back_to_start`.
+    If `expected` is given, it begins at the position just found minus the expected motion.
 
     Returns (N, 2) float32 positions in the second image, and (N,) distances in pixels between the
     start and the end of each round trip, infinite for lost tracks.
@@ -287,9 +287,10 @@ WINDOWS_AT_ONCE = 4096
 def zncc_at_points(
     images: tuple[np.ndarray, np.ndarray], points: tuple[np.ndarray, np.ndarray], side: int
 ) -> np.ndarray:
-    """Return the ZNCC of the windows around the (M, 2) points of each match, (M,) float64.
+    """Return the ZNCC between the windows around matched points of two images, (M,) float64.
 
-    The windows have `side` x `side` pixels, and the images are blurred first.
+    `points` are the (M, 2) positions in each image. The windows have `side` x `side` pixels, and
+    the images are blurred first.
     """
     blurred = [gaussian_blur(image, BLUR_SIGMA_PX) for image in images]
     offsets = np.indices((side, side))[::-1].reshape(2, -1) - (side - 1) / 2
@@ -307,8 +308,9 @@ def zncc_at_points(
 
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99
-"""The image is blurred with the sigma EDGE_SIGMA_PX before its gradient is computed. Lengths of the
-gradient are scaled so that this quantile of them becomes white (255). Both were chosen by hand."""
+"""The image is blurred with the sigma EDGE_SIGMA_PX before its gradient is computed. Its lengths
+are then scaled so that their quantile EDGE_QUANTILE becomes white (255). Both were chosen by
+hand."""
 
 
 def edge_strength(gray: np.ndarray) -> np.ndarray:

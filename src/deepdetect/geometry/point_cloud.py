@@ -12,7 +12,7 @@ from .._shared.options import suggest_keywords
 UNITS = {
     "m": "metres",
     "mm": "millimetres",
-    "baseline": "baselines (1 = the distance of the two cameras)",
+    "baseline": "baselines (1 = the distance between the two cameras)",
     "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
 }
 """Units of length, each with the words that describe it in files. Lengths in one of the last two
@@ -38,7 +38,7 @@ class PointCloud:
         points: (N, 3) float32 or float64 positions. In the frame of a camera x is right, y down,
             and z forward, and the camera's centre is (0, 0, 0).
         colors: (N, 3) uint8 sRGB.
-        unit: "mm", "m", "baseline" (the distance of the two cameras) or "spacing" (the median
+        unit: "mm", "m", "baseline" (the distance between the two cameras) or "spacing" (the median
             distance from one of many cameras to the nearest other).
         frame: name of the camera whose frame it is, or `EAST_NORTH_UP`.
         normals: (N, 3) float32 unit vectors, which point towards the cameras, or None.

@@ -125,8 +125,8 @@ def correct_matches(
         step = step * 2 * root / ((next0**2).sum(1) + (next1**2).sum(1))
         moved0 = points0 - step[:, None] * next0
         moved1 = points1 - step[:, None] * next1
-    # A match at an epipole, where the correction is not finite, stays where it is. It is correct,
-    # because every line through an epipole is an epipolar line.
+    # The correction of a match at an epipole is not finite. This match needs none, because every
+    # line through an epipole is an epipolar line.
     known = np.isfinite(moved0).all(1) & np.isfinite(moved1).all(1)
     return np.where(known[:, None], moved0, points0), np.where(known[:, None], moved1, points1)
 
@@ -274,10 +274,10 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def best_of_four(
     essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return that of the four poses of an essential matrix which agrees best with the matches.
+    """Return the one of the four poses of an essential matrix that the matches support most.
 
-    It is the pose with most points in front of both cameras. The essential matrix is in normalised
-    coordinates, and the (M, 2) matches are in pixels.
+    For this pose, most triangulated points lie in front of both cameras. The essential matrix is in
+    normalised coordinates, and the (M, 2) matches are in pixels.
     """
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
     points0, points1 = _evenly(points0), _evenly(points1)

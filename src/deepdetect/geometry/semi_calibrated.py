@@ -92,7 +92,7 @@ def estimate_semi_calibrated(
         alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
         return TwoViewModel("fundamental", fundamental, inliers, alarms)
 
-    # OpenCV draws the same row numbers every time. Shuffled matches give other samples.
+    # OpenCV always draws the same samples; shuffled matches make them depend on the seed.
     order = np.random.default_rng(seed).permutation(len(points0))
     best = start = None
     for focal in FOCAL_LENGTHS:

@@ -1,4 +1,4 @@
-"""Points under homographies and fundamental matrices, and the errors of matches in pixels."""
+"""Apply homographies and fundamental matrices to points, and measure errors of matches."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
 
 
 def score_errors(errors: np.ndarray) -> dict[str, float]:
-    """Score the (N,) errors of `disparity_errors`, NaN where the ground truth is unknown.
+    """Score the (N,) errors from `disparity_errors`, which are NaN without ground truth.
 
     Returns the number of all "matches", of "evaluated" matches (with known ground truth), and of
     "correct" matches (within `TOLERANCE_PX`), and the "precision": correct / evaluated.
@@ -143,7 +143,7 @@ def scaling_matrix(scale: float) -> np.ndarray:
 
 
 def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
-    """Return positions of an image in a copy of it that is `scale` times as large.
+    """Map positions in an image to a copy of it that is `scale` times as large.
 
     In both, the centres of pixels have integer coordinates.
     """

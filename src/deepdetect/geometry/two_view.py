@@ -70,7 +70,10 @@ def fit_model(
     threshold_px: float,
     seed: int = 0,
 ) -> TwoViewModel:
-    """Fit a homography or a fundamental matrix to (M, 2) matches; compute its false alarms."""
+    """Fit a homography or a fundamental matrix to (M, 2) matches.
+
+    The result includes the log10 of its number of false alarms.
+    """
     options = GeometryOptions(inlier_threshold=threshold_px)
     geometry = estimate_geometry(points0, points1, model, seed=seed, options=options)
     if geometry.matrix is None:

@@ -37,7 +37,8 @@ class PointFilterOptions:
             the focal length), because smaller angles do not determine a depth. For rectified pairs,
             it is the minimum disparity, including the disparity offset.
         sor_neighbors: number of nearest neighbours in `disparity_space` with which SOR compares a
-            point; 0 turns SOR off. For rectified pairs SOR uses a window of pixels, unless it is 0.
+            point; 0 turns SOR off. For rectified pairs SOR compares a point with all others in a
+            window of pixels instead, but 0 also turns it off.
         sor_std_ratio: a point is an outlier if its distance from its neighbours is above the mean
             of all points by more than this number of standard deviations.
 

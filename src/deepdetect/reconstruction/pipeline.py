@@ -46,10 +46,10 @@ SOR_WINDOW_PX = 9
 window with this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
-"""These are the minimum fractions of keypoints with a match on their row. MIN_UNIQUE_FRACTION holds
-if matches must be unique: the fraction was up to 0.005 for unrelated images, and at least 0.35 for
-rectified pairs. MIN_MATCHED_FRACTION holds if they need not be unique: the fraction was up to 0.16
-for unrelated images, and at least 0.64 for rectified pairs."""
+"""These are the minimum fractions of keypoints with a match on their row. MIN_UNIQUE_FRACTION
+applies if matches must be unique: the fraction was up to 0.005 for unrelated images, and at least
+0.35 for rectified pairs. MIN_MATCHED_FRACTION applies if they need not be unique: the fraction was
+up to 0.16 for unrelated images, and at least 0.64 for rectified pairs."""
 
 
 @suggest_keywords
@@ -83,8 +83,8 @@ def reconstruct(
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         rectified: whether matches lie on the same row of both images. None detects it.
         selection: which pixels of a heat map become keypoints; None takes those with a probability
-            above 0.5. With a density of 1, every pixel of a rectified pair becomes a point, by the
-            disparity options `DENSE`. `subpixel` is ignored.
+            above 0.5. With a density of 1, every pixel of a rectified pair becomes a point, with
+            the disparity options `DENSE`. `subpixel` is ignored.
         ignore: masks as in `match_images`; for a rectified pair, only the mask of the left image.
         seed: seed of all random choices.
         point_filter: which points are kept.
@@ -229,7 +229,7 @@ def _from_disparities(
     point_filter: PointFilterOptions,
     timer: StageTimer,
 ) -> dict[str, Any]:
-    """Compute the points of a rectified pair at left keypoints; return `Reconstruction` fields."""
+    """Compute points at the left keypoints of a rectified pair; return `Reconstruction` fields."""
     check_cameras(calibration)
     keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
     if not len(keypoints):

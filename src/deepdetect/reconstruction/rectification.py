@@ -1,4 +1,4 @@
-"""Recognise rectified pairs, and check that the calibration of such a pair fits and it has depth.
+"""Recognise rectified pairs, and check that the calibration fits and that they show depth.
 
 The matches of a rectified pair lie on the same row in both images. This rule has no parameters. A
 pair is rectified if the rule explains about as many matches as the best models with parameters,
@@ -167,7 +167,7 @@ def _coarse_pass(
         decided = on_rows and _row_error(*coarse.matched, seed) < limit
     else:
         best = max(found.by_fundamental, found.by_other_rows)
-        # The pair is rejected only with a margin: three standard deviations of a binomial.
+        # Rejection needs a margin of three standard deviations of a binomial distribution.
         deviation = np.sqrt(best * MIN_INLIER_RATIO * (1 - MIN_INLIER_RATIO))
         decided = found.on_rows < MIN_INLIER_RATIO * best - 3 * deviation
     if not decided:
@@ -179,12 +179,12 @@ def _coarse_pass(
 
 
 def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
-    """Return how many pixels the rows of a pair that looks rectified are off, as a high quantile.
+    """Return the `MIN_INLIER_RATIO` quantile of the row errors of a pair that looks rectified.
 
-    A single match is too inaccurate to tell by how much rows are off at its position. Therefore a
-    smooth function is fitted to the distances of all matches from their rows, and its values are
-    used. It depends on the position (for rotated views and lens distortion) and on the disparity
-    (for a camera that also moved up or down).
+    The row error is how many pixels the rows of the two images are off at a position. A single
+    match is too inaccurate to tell it. Therefore a smooth function is fitted to the distances of
+    all matches from their rows, and its values are used. It depends on the position (for rotated
+    views and lens distortion) and on the disparity (for a camera that also moved up or down).
     """
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
@@ -203,7 +203,10 @@ def detect_rectification(
     offset_px: float = 0.0,
     seed: int = 0,
 ) -> Rectification:
-    """Decide from (M, 2) matches whether a pair is rectified; both images are (width, height)."""
+    """Decide from (M, 2) matches whether a pair is rectified.
+
+    `size` is the (width, height) of both images, and `offset_px` the disparity offset.
+    """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)

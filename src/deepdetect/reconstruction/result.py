@@ -93,7 +93,7 @@ class Reconstruction:
 
     @property
     def baseline_vector(self) -> np.ndarray:
-        """Vector from the left to the right camera centre, (3,) float64, in the left frame."""
+        """Vector from the left camera centre to the right one, (3,), in the left camera's frame."""
         length = 1.0 if self.calibration.baseline_mm is None else self.calibration.baseline_mm
         if self.pose is None:
             return np.array([length, 0, 0])

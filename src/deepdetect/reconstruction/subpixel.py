@@ -37,9 +37,10 @@ AFFINITY_WINDOW_PX = 15
 """The affinity of a patch is fitted to the matches in a window with this side. Chosen by hand."""
 
 AFFINITY_REGULARIZATION = 20.0
-"""The fit of an affinity gives the similarity of all matches the weight of this number of matches
-that fill the window. If there are few matches, or all lie on one line, the affinity is therefore
-close to the similarity. Chosen by hand."""
+"""When an affinity is fitted to the matches in a window, the similarity that is fitted to all
+matches counts as much as this number of matches, evenly spread over the window. If there are few
+matches, or all lie on one line, the affinity is therefore close to the similarity. Chosen by
+hand."""
 
 MAX_SIMILARITY_SAMPLES = 5000
 """The similarity is estimated from at most this number of matches, to save time."""
@@ -51,12 +52,13 @@ CORNER_WINDOW_PX = 7
 def refine_matches(
     gray0: np.ndarray, gray1: np.ndarray, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine the (N, 2) positions of matches in the second image; the first positions are kept.
+    """Refine the (N, 2) positions of matches in the second image to sub-pixel accuracy.
 
     The positions in the second image must be accurate to a pixel or two. Those in the first image
     are rounded to whole pixels. Returns the refined (N, 2) float64 positions, and (N,) bool, True
     for matches that converged. A match does not converge if its patch is flat, crosses the border,
-    moves too far or stays too different. An alignment that does not converge moves nothing.
+    moves too far or stays too different. An alignment that does not converge leaves the position
+    unchanged.
     """
     pixels0 = np.rint(points0).astype(np.int64)
     start = np.array(points1, np.float64, order="C")

@@ -75,7 +75,7 @@ NO_DEPTH = {
 def refined_corners(
     images: tuple[np.ndarray, np.ndarray], points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions, (K, 2) each, of matches at corners, refined to sub-pixel accuracy.
+    """Return the matches at corners, refined to sub-pixel accuracy, as two (K, 2) arrays.
 
     Matches whose refinement does not converge are left out.
     """
