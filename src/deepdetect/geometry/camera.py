@@ -101,10 +101,7 @@ class Camera:
         return directions
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project (N, 3) points in the camera's frame to (N, 2) pixels.
-
-        In this frame x is right, y down and z forward.
-        """
+        """Project (N, 3) points in the camera's frame (y down, z forward) to (N, 2) pixels."""
         points = numbers_of("points", points, np.float64, 3)
         with np.errstate(divide="ignore", invalid="ignore"):
             return points[:, :2] / points[:, 2:] * self.focal_px + self.centre
@@ -290,10 +287,7 @@ def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
 def fundamental_matrix(
     calibration: Calibration, rotation: np.ndarray, translation: np.ndarray
 ) -> np.ndarray:
-    """Return the (3, 3) fundamental matrix F of two cameras: x1^T F x0 = 0 in pixels.
-
-    The pose of the second camera is X1 = rotation @ X0 + translation.
-    """
+    """Return F, (3, 3), with x1^T F x0 = 0 in pixels, for X1 = rotation @ X0 + translation."""
     essential = cross_matrix(translation) @ rotation
     inverse0 = np.linalg.inv(calibration.camera0.matrix)
     return np.linalg.inv(calibration.camera1.matrix).T @ essential @ inverse0
@@ -306,10 +300,7 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def angles_between(vectors0: np.ndarray, vectors1: np.ndarray) -> np.ndarray:
-    """Return the angles between the rows of two (N, 3) arrays, (N,) in radians.
-
-    Small angles are accurate as well, unlike those from an arccosine.
-    """
+    """Return the (N,) angles in radians between (N, 3) vectors; small ones are accurate as well."""
     across = np.linalg.norm(np.cross(vectors0, vectors1), axis=1)
     return np.asarray(np.arctan2(across, np.einsum("ij,ij->i", vectors0, vectors1)))
 
@@ -354,10 +345,7 @@ class PosedView:
 
 
 def camera_spacing(centres: np.ndarray) -> float:
-    """Return the median, over all cameras, of the distance to the nearest other camera.
-
-    The centres of the cameras are (V, 3).
-    """
+    """Return the median distance from a camera to its nearest neighbour; `centres` is (V, 3)."""
     blocks = np.array_split(centres, len(centres) // 500 + 1)  # the blocks bound the memory
     distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
     second = min(1, len(centres) - 1)  # index 0 is the camera itself

@@ -102,8 +102,7 @@ def _parsed(content: bytes) -> Values:
         return lines
     import yaml
 
-    # The constructor for OpenCV's tags is added to a subclass, so PyYAML's loader is unchanged.
-    Loader: Any = type("Loader", (yaml.SafeLoader,), {})
+    Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # a subclass, to accept OpenCV's tags
     Loader.add_multi_constructor("", lambda loader, _, node: loader.construct_mapping(node, True))
     # ROS ends its file with the start of a second YAML document, so only the first one is read.
     values = next(yaml.load_all(re.sub(r"\A%YAML[^\n]*\n", "", text), Loader), None)
@@ -127,10 +126,7 @@ def _xml_values(node: ElementTree.Element) -> Any:
 
 
 def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | None:
-    """Return the first value under `keys` that has one of the numbers of elements `sizes`.
-
-    It is reshaped to three rows. None if there is no such value.
-    """
+    """Return the first value with an allowed number of elements, as three rows, or else None."""
     for key in keys:
         value = values.get(key)
         data = value.get("data") if isinstance(value, Mapping) else value
@@ -169,10 +165,7 @@ def _both(left: np.ndarray, right: np.ndarray, size: Any, baseline_mm: Any) -> d
 
 
 def _metres(left: np.ndarray, right: np.ndarray) -> float | None:
-    """Return the distance between the cameras of two projection matrices, in their unit.
-
-    None if a matrix has no fourth column, or if the distance is 0.
-    """
+    """Return the distance between the cameras of two projection matrices; None if not known."""
     if left.shape[1] < 4 or right.shape[1] < 4:
         return None
     distance = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
@@ -207,9 +200,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
     if not cameras:
         return None
     if len(cameras) > 2:
-        raise ReconstructionError(
-            f"it has {len(cameras)} cameras: keep only the left and the right one"
-        )
+        raise ReconstructionError(f"it has {len(cameras)} cameras: keep the left and the right one")
     made = []
     for model, (width, height, *numbers) in cameras:
         _check_distortion(0, model)
@@ -224,10 +215,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _kitti(values: Values, views: tuple[int, int] | None) -> dict[str, Any] | None:
-    """Read the projection matrices of KITTI: P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw).
-
-    Cameras 2 and 3 are the colour cameras.
-    """
+    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw); 2 and 3 are in colour."""
     for start in ("P", "P_rect_0"):
         for pair in (views or (2, 3), (2, 3), (0, 1)):
             left, right = (_matrix(values, [f"{start}{view}"], 12) for view in pair)
@@ -268,10 +256,7 @@ def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _opencv(values: Values, _: Any) -> dict[str, Any] | None:
-    """Read a file of OpenCV or ROS.
-
-    Distortion is an error unless the file also has the projection matrices of rectified cameras.
-    """
+    """Read a file of OpenCV or ROS; if it has distortion, it also needs rectified projections."""
     for first, second, distortion in STEREO:
         left, right = (_matrix(values, [key], 9, 12) for key in (first, second))
         if left is not None and right is not None:

@@ -30,17 +30,16 @@ line its square is allowed. A view that needs a larger factor gets a polar frame
 Middlebury, Strecha's fountain and KITTI."""
 
 MAX_AREA = 3.0
-"""Maximum area of a planar frame, relative to the area of the larger view. Chosen on Oxford,
-Middlebury, Strecha's fountain and KITTI."""
+"""Maximum area of a planar frame, relative to the larger view. Chosen like `MAX_STRETCH`."""
 
 RESOLVED_QUANTILE = 0.6
-"""A polar frame has the resolution of the first view at one distance from the epipole, and enlarges
-what is nearer and reduces what is farther. That distance is this quantile of the distances of all
-pixels of the view. Chosen on Oxford, Middlebury, Strecha's fountain and KITTI."""
+"""A polar frame has the resolution of the first view at one distance from the epipole. What is
+nearer is enlarged, and what is farther is reduced. That distance is this quantile of the distances
+of all pixels of the view. Chosen like `MAX_STRETCH`."""
 
 MIN_RADIUS_PX = 8.0
 """A polar frame leaves out pixels nearer to the epipole than this, because hardly anything moves
-there. Chosen on Oxford, Middlebury, Strecha's fountain and KITTI."""
+there. Chosen like `MAX_STRETCH`."""
 
 MAX_SIDE_PX = 2**15 - 2
 """Maximum width and height of a frame, because OpenCV cannot warp to a larger one."""
@@ -169,8 +168,7 @@ def rectified_frame(
     The frame is planar if that distorts the views little, otherwise polar. The result is None if
     neither is possible or there are fewer than eight matches. Sizes are (width, height). `plane`
     may be the homography of a plane in the scene, from the first view to the second. It is used to
-    warp the second view to the first before the rectification, so that the plane does not look
-    slanted.
+    first warp the second view to the first, which removes the slant of the plane.
     """
     if plane is not None:
         shown = transform_points(points1, np.linalg.inv(plane))

@@ -26,8 +26,7 @@ MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
 ignores the inlier threshold if there are fewer."""
 
 MAX_LOG10_NFA = -6.0
-"""A geometry is trusted if the log10 of its number of false alarms is below this. Chosen by
-hand."""
+"""A geometry is trusted if log10 of its number of false alarms is below this. Chosen by hand."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Number of matches that the minimal solver of each model needs."""
@@ -38,27 +37,23 @@ Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MAX_EPIPOLE_DISTANCE_PX = 1.5
 """A match off the plane agrees with an epipole if its position in the second image is closer than
-this to the line through the epipole and the position that the homography predicts. Chosen on
-Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+this to the line through the epipole and the predicted position. Chosen like `MIN_PARALLAX_PX`."""
 
 MIN_FRACTION_OF_PLANE = 0.2
 """A scene has depth only if the number of matches that agree on an epipole is at least this
-fraction of the number of matches on the plane. Repeated patterns and moved objects give fewer.
-Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+fraction of the number on the plane. Repeated patterns and moved objects give fewer. Chosen like
+`MIN_PARALLAX_PX`."""
 
 MIN_FRACTION_OF_REST = 0.5
-"""If nothing else shows that a scene has depth, at least this fraction of the matches off the
-plane must agree on an epipole. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI
-clip."""
+"""If nothing else shows that a scene has depth, at least this fraction of the matches off the plane
+must agree on an epipole. Chosen like `MIN_PARALLAX_PX`."""
 
 MAX_MATCHES = 2000
-"""`measure_parallax` uses at most this number of matches off the plane, drawn at random. Chosen by
-hand."""
+"""`measure_parallax` uses at most this many random matches off the plane. Chosen by hand."""
 
 SAMPLES = 1000
-"""Number of candidate epipoles. Two matches are drawn at random for each candidate. Each match
-gives the line through its predicted and its actual position, and the two lines intersect in the
-candidate. Chosen by hand."""
+"""Number of candidate epipoles. Each is the intersection of the lines that two random matches give,
+from the predicted to the actual position. Chosen by hand."""
 
 
 @suggest_keywords
@@ -363,10 +358,7 @@ class Parallax:
         return self.log10_nfa < MAX_LOG10_NFA
 
     def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether enough matches agree on an epipole, relative to the number on the plane.
-
-        They must be `significant`, and at least `fraction_of_plane` times that number.
-        """
+        """Whether `significant`, and `agreeing` is at least this fraction of `on_plane`."""
         return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property
@@ -398,10 +390,7 @@ class TwoViewModel(Geometry):
 def measure_parallax(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, seed: int = 0
 ) -> Parallax:
-    """Take the matches that a homography does not explain; find the epipole on which most agree.
-
-    `points0` and `points1` are the (M, 2) positions of all matches.
-    """
+    """Find an epipole on which those (M, 2) matches agree that are off the homography's plane."""
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX
     on_plane = len(off) - int(np.count_nonzero(off))
@@ -439,11 +428,7 @@ def measure_parallax(
 
 
 def _misses(epipoles: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the distances of points from the lines through an epipole and a predicted point.
-
-    All are homogeneous: `epipoles` (E, 3), predicted points `first` (N, 3) and actual points
-    `second` (N, 3). The distances are (E, N).
-    """
+    """Return the (E, N) distances of points from the lines through epipoles and predictions."""
     x, y, scale = epipoles.T[:, :, None]
     normal = np.hypot(y - scale * first[:, 1], scale * first[:, 0] - x)
     return np.abs(epipoles @ np.cross(first, second).T) / np.maximum(normal, 1e-12)

@@ -42,22 +42,19 @@ MIN_TRACKS = 15
 
 TRACKING_ITERATIONS = 15
 TRACKING_STEP_PX = 0.02
-"""A corner has converged when an iteration of the tracking moves it by less than this. Chosen by
-hand."""
+"""A corner has converged when a tracking step moves it by less than this. Chosen by hand."""
 
 MAX_ROUND_TRIP_PX = 0.3
 """A corner is tracked to the second image and back. The track is kept if it ends at less than this
 distance from its start. Chosen by hand."""
 
 CAUCHY_SCALE_PX = 1.0
-"""A track with this residual has half the weight of a track without residual when a homography is
-fitted. Chosen by hand."""
+"""A track with this residual has half the weight of one without residual. Chosen by hand."""
 
 IRLS_ITERATIONS = 30
 
 ALIGNMENT_SIDE_PX = 480
-"""The images whose pixels are aligned are reduced until their longer side has at most this many
-pixels. Chosen by hand."""
+"""Images are reduced to this longer side before their pixels are aligned. Chosen by hand."""
 
 ALIGNMENT_SIGMA_PX = 1.0
 """The reduced copies are blurred with this sigma before they are aligned. Chosen by hand."""

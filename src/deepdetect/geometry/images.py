@@ -11,25 +11,21 @@ from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
 ANTIALIASING_SIGMA = 0.5
-"""An image that will be sampled at a `scale` below 1 is first blurred with a sigma of this value
-times sqrt(1 / scale^2 - 1) pixels. Chosen by hand."""
+"""The blur before downscaling has a sigma of this times sqrt(1 / scale^2 - 1). Chosen by hand."""
 
 WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25
-"""Images are blurred with this sigma before they are compared, because noise and resampling would
-lower the correlation. Chosen by hand."""
+"""Images are blurred by this sigma against noise before they are compared. Chosen by hand."""
 
 NOISE_STD = 2.0
 """`normalise_local_contrast` adds the square of this number of grey levels to the variance of each
 window, so that noise is not amplified in flat windows. Chosen by hand."""
 
 MAX_UNKNOWN_WEIGHT = 1e-3
-"""An interpolated pixel is kept only if the pixels without data that it depends on have less than
-this total weight. Chosen by hand."""
+"""Maximum total weight of pixels without data in an interpolated pixel. Chosen by hand."""
 
 MIN_VARIANCE = 1.0
-"""Windows are too flat to be compared if the variance of their grey levels is not above this.
-Chosen by hand."""
+"""Windows with a variance of grey levels up to this are too flat to compare. Chosen by hand."""
 
 
 def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
@@ -189,13 +185,9 @@ def window_sums(
 ) -> np.ndarray:
     """Sum the values of sparse pixels over square windows, one sum for each window, (M,).
 
-    Args:
-        pixels: (N, 2) int64 pixels (x, y) that have a value, all different.
-        values: (N,) values of these pixels, or one value for all.
-        shape: shape of the image, (H, W, ...).
-        window_px: side of the windows.
-        at: (M, 2) pixels at which the windows are centred; by default `pixels`.
-        dtype: type of the sums; by default that of the values.
+    `pixels` are (N, 2) int64 (x, y), all different. `values` has one value for each of them, or is
+    one value for all. `shape` is that of the image, (H, W, ...). The windows are centred at the
+    (M, 2) pixels `at`, by default at `pixels`. The sums have the type of the values, or `dtype`.
     """
     image = _scatter(pixels, values, shape, dtype)
     window = (window_px, window_px)
@@ -207,10 +199,7 @@ def window_sums(
 def gaussian_means(
     pixels: np.ndarray, values: np.ndarray, shape: Sequence[int], sigma_px: float, at: np.ndarray
 ) -> np.ndarray:
-    """Return the mean of the values around each pixel `at`, with Gaussian weights; (M,) float32.
-
-    `pixels`, `values` and `shape` are those of `window_sums`.
-    """
+    """Average the values around each pixel `at` with Gaussian weights, (M,); see `window_sums`."""
     count, total = (_scatter(pixels, part, shape, np.float32) for part in (1, values))
     count, total = (cv2.GaussianBlur(image, (0, 0), sigma_px) for image in (count, total))
     x, y = at.T
@@ -287,11 +276,7 @@ WINDOWS_AT_ONCE = 4096
 def zncc_at_points(
     images: tuple[np.ndarray, np.ndarray], points: tuple[np.ndarray, np.ndarray], side: int
 ) -> np.ndarray:
-    """Return the ZNCC between the windows around matched points of two images, (M,) float64.
-
-    `points` are the (M, 2) positions in each image. The windows have `side` x `side` pixels, and
-    the images are blurred first.
-    """
+    """Return the (M,) ZNCC of blurred windows around (M, 2) matched points; `side` is in pixels."""
     blurred = [gaussian_blur(image, BLUR_SIGMA_PX) for image in images]
     offsets = np.indices((side, side))[::-1].reshape(2, -1) - (side - 1) / 2
     correlations = np.empty(len(points[0]))
@@ -308,9 +293,8 @@ def zncc_at_points(
 
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99
-"""The image is blurred with the sigma EDGE_SIGMA_PX before its gradient is computed. Its lengths
-are then scaled so that their quantile EDGE_QUANTILE becomes white (255). Both were chosen by
-hand."""
+"""EDGE_SIGMA_PX is the sigma of the blur before the gradient is computed. Gradient lengths are
+scaled so that their quantile EDGE_QUANTILE becomes white (255). Both were chosen by hand."""
 
 
 def edge_strength(gray: np.ndarray) -> np.ndarray:

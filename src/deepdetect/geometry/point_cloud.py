@@ -109,10 +109,7 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class RobustBox:
-    """An axis-aligned box around all points except the outermost.
-
-    `low` and `high` are its (3,) corners with the lowest and the highest coordinates.
-    """
+    """An axis-aligned box, from corner `low` to `high`, around all points but the outermost."""
 
     low: np.ndarray
     high: np.ndarray

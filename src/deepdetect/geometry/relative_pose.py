@@ -23,12 +23,10 @@ MAX_ITERATIONS = 10
 """Gauss-Newton stops after this many steps. Chosen by hand."""
 
 DERIVATIVE_STEP = 1e-6
-"""Numerical derivatives are computed by varying each parameter of the pose by this angle, in
-radians."""
+"""Numerical derivatives vary each parameter of the pose by this angle, in radians."""
 
 MIN_CHANGE = 1e-9
-"""The refinement ends when a step changes every parameter of the pose by less than this angle, in
-radians."""
+"""The refinement ends when no parameter of the pose changes by more than this, in radians."""
 
 MAX_REFITS = 4
 """The pose that RANSAC finds is fitted to its inliers, which are then determined again. This is

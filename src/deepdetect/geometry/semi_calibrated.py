@@ -27,9 +27,8 @@ MODELS_PER_SAMPLE = 10
 """The solver finds up to ten essential matrices for each sample of five matches."""
 
 START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
-"""Candidates for the initial focal length of a fit, in units of the longer side of the image. The
-fit starts from the one that turns the fundamental matrix most nearly into an essential matrix.
-Chosen by hand."""
+"""Candidates for the initial focal length of a fit, in units of the longer side of the image. A fit
+starts from the one that makes the fundamental matrix most nearly essential. Chosen by hand."""
 
 MIN_MATCHES = 6
 """Five matches determine an essential matrix; a sixth is needed to test it."""
@@ -57,8 +56,7 @@ PRINCIPAL_POINT_SPREAD = 0.03
 standard deviation, in units of the longer side of the image. Chosen by hand."""
 
 MATCH_SIGMA_PX = 0.5
-"""Standard deviation of the distances of correct matches from their epipolar lines. Chosen by
-hand."""
+"""Standard deviation of correct matches from their epipolar lines. Chosen by hand."""
 
 MAX_FITS = 4
 """Pose and cameras are fitted at most this many times, each time to the inliers of the previous
@@ -147,11 +145,7 @@ def refine_fundamental(
 
 
 def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Cameras:
-    """Return the cameras for which the matrix becomes most nearly an essential matrix.
-
-    Their focal length is one of `START_FOCAL_LENGTHS`. An essential matrix has two equal singular
-    values.
-    """
+    """Return the cameras whose focal length makes the matrix most nearly an essential matrix."""
 
     def likeness(cameras: _Cameras) -> float:
         largest, middle, _ = np.linalg.svd(cameras.essential(fundamental), compute_uv=False)

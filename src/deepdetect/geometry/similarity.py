@@ -39,13 +39,11 @@ HUBER_STDS = 2.0
 """Residuals larger than this number of standard deviations get less weight. Chosen by hand."""
 
 WRONG_STDS = 5.0
-"""A point gets no weight if its residual is larger than this number of standard deviations. Chosen
-by hand."""
+"""A point with a residual above this many standard deviations gets no weight. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
-"""The standard deviation of the targets is estimated from their stated accuracy and the residuals.
-The accuracy has the weight of this number of residuals, because a few residuals say little. Chosen
-by hand."""
+"""The stated accuracy of the targets counts as much as this number of residuals, because a few
+residuals say little about the true accuracy. Chosen by hand."""
 
 MAD_STD = 1.4826
 """Ratio of the standard deviation of normally distributed values to the median of their absolute
@@ -186,10 +184,7 @@ def _search(
     scale: float | None,
     seed: int,
 ) -> Similarity | None:
-    """Find the similarity with the least median distance between targets and transformed points.
-
-    Candidates are fitted to random samples of three points, or of two points and `up`.
-    """
+    """Find the similarity of 3 random points, or of 2 and `up`, with the least median distance."""
     random = np.random.default_rng(seed)
     best: dict[bool, tuple[float, Similarity | None]] = dict.fromkeys((True, False), (np.inf, None))
     for size in [3] * MAX_SAMPLES + [2] * (0 if up is None else MAX_SAMPLES):

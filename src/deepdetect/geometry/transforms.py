@@ -143,18 +143,12 @@ def scaling_matrix(scale: float) -> np.ndarray:
 
 
 def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
-    """Map positions in an image to a copy of it that is `scale` times as large.
-
-    In both, the centres of pixels have integer coordinates.
-    """
+    """Map positions to a copy of the image at `scale`; pixel centres are whole numbers in both."""
     return (np.asarray(points, np.float64) + 0.5) * scale - 0.5
 
 
 def scaled_homography(homography: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
-    """Return the homography between copies of both images that are scaled by `scale0` and `scale1`.
-
-    Its last element is 1.
-    """
+    """Return the homography between scaled copies of two images; its last element is 1."""
     matrix = scaling_matrix(scale1) @ homography @ scaling_matrix(1 / scale0)
     return matrix / matrix[2, 2]
 

@@ -26,35 +26,33 @@ from .semi_calibrated import START_FOCAL_LENGTHS, estimate_semi_calibrated
 from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
-"""Inlier thresholds in pixels of models that only guide the matching. They are rather high, because
-keypoints found in reduced copies of the images are inaccurate."""
+"""Inlier thresholds in pixels of the models that guide matching. They are fitted to keypoints of
+reduced copies of the images, which are less accurate."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
 """Inlier thresholds in pixels of the models by which a scene is classified. Chosen on Oxford,
 Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_MATCHES = 30
-"""A scene with fewer matches than this is not classified. Chosen on Oxford, Middlebury, Strecha's
-fountain and a KITTI clip."""
+"""A scene with fewer matches than this is not classified. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MIN_PLANAR_RATIO = 0.75
-"""A scene is a plane only if the number of inliers of the homography is at least this fraction of
-that of the fundamental matrix. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI
-clip."""
+"""A scene is a plane only if the homography has at least this fraction of the number of inliers of
+the fundamental matrix. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MAX_MEDIAN_MOTION_PX = 0.5
 """Two images show the same view only if the median distance that the matches move is below this."""
 
 MAX_MOTION_PX, MOTION_QUANTILE = 3.0, 0.9
 """Two images show the same view only if the MOTION_QUANTILE of the distances that matches move is
-below MAX_MOTION_PX. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+below MAX_MOTION_PX. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 FOREGROUND_DISTANCE_PX = 6.0
 """A match is clearly off the plane if its transfer error under the homography is above this."""
 
 MIN_FOREGROUND_FRACTION = 0.05
 """There is a foreground only if at least this fraction of the inliers of the fundamental matrix is
-clearly off the plane. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+clearly off the plane. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MIN_FOREGROUND_ON_LINES = 0.8
 """There is a foreground only if at least this fraction of the matches clearly off the plane are
@@ -70,10 +68,7 @@ def fit_model(
     threshold_px: float,
     seed: int = 0,
 ) -> TwoViewModel:
-    """Fit a homography or a fundamental matrix to (M, 2) matches.
-
-    The result includes the log10 of its number of false alarms.
-    """
+    """Fit a model to (M, 2) matches, and compute the logarithm of its number of false alarms."""
     options = GeometryOptions(inlier_threshold=threshold_px)
     geometry = estimate_geometry(points0, points1, model, seed=seed, options=options)
     if geometry.matrix is None:
@@ -157,10 +152,7 @@ def is_planar(
     epipolar: TwoViewModel,
     seed: int = 0,
 ) -> bool:
-    """Return whether the homography `plane` explains the correct ones among (M, 2) matches.
-
-    Many of the matches may be wrong.
-    """
+    """Return whether the homography `plane` explains the correct ones among (M, 2) matches."""
     least = MIN_PLANAR_RATIO * np.count_nonzero(epipolar.inliers)
     if plane.matrix is None or np.count_nonzero(plane.inliers) < least:
         return False
@@ -194,10 +186,7 @@ def is_static(motion_px: np.ndarray) -> bool:
 
 
 def is_pure_rotation(points0: np.ndarray, points1: np.ndarray, calibration: Calibration) -> bool:
-    """Return whether a rotation maps the rays of the first image to those of their matches.
-
-    The rotation is found by Kabsch's method.
-    """
+    """Return whether a rotation maps the first image's rays to those of their matches (Kabsch)."""
     rays0, rays1 = (
         rays / np.linalg.norm(rays, axis=1, keepdims=True)
         for rays in (calibration.camera0.rays(points0), calibration.camera1.rays(points1))
@@ -210,10 +199,7 @@ def is_pure_rotation(points0: np.ndarray, points1: np.ndarray, calibration: Cali
 
 
 def is_usual_rotation(points0: np.ndarray, points1: np.ndarray, sizes: tuple[Size, Size]) -> bool:
-    """Return whether a rotation of a camera of unknown focal length explains (M, 2) matches.
-
-    The focal lengths that are tried are `START_FOCAL_LENGTHS`.
-    """
+    """Return whether a rotation explains (M, 2) matches at one of `START_FOCAL_LENGTHS`."""
     for focal in START_FOCAL_LENGTHS:
         cameras = [Camera(size, focal * max(size)) for size in sizes]
         if is_pure_rotation(points0, points1, Calibration(cameras[0], cameras[1])):

@@ -20,10 +20,7 @@ ENDINGS = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", "_depth.jpg", ".jso
 def save_reconstruction(
     found: Reconstruction, paths: Mapping[str, Path], title: str, **values: Any
 ) -> dict[str, Any]:
-    """Write one file for each of `ENDINGS`; return the content of the JSON file.
-
-    The JSON file contains the summary of the reconstruction, and `values`.
-    """
+    """Write a file for each of `ENDINGS`; return what the JSON contains, including `values`."""
     started = time.perf_counter()
     summary = found.summary()
     notes = {

@@ -85,10 +85,7 @@ def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
 
 
 def disparity_space(points: np.ndarray, focal_px: float, baseline: float = 1.0) -> np.ndarray:
-    """Return (N, 3) points as rows (x, y, weight * disparity) in pixels of the first camera.
-
-    x and y are relative to the principal point. The weight is `SOR_DISPARITY_WEIGHT`.
-    """
+    """Return (N, 3) points as rows (x, y, weight * disparity) in pixels of the first camera."""
     across = points[:, :2] / points[:, 2:] * focal_px
     disparity = focal_px * baseline / points[:, 2]
     return np.column_stack([across, SOR_DISPARITY_WEIGHT * disparity])

@@ -36,8 +36,7 @@ spread by at least this. Those of a slanted plane do; those of a camera that onl
 spread less than this."""
 
 GRID_SIZE_PX = 8
-"""The left image is divided into cells with this side, and one match is used from each cell. Chosen
-by hand."""
+"""The left image is divided into cells of this side. Each gives one match. Chosen by hand."""
 
 ITERATIONS = 500
 """RANSAC in `_best_other_rows` draws this number of samples of three matches. Chosen by hand."""
@@ -72,8 +71,8 @@ MIN_DISPARITY_PX = -1.0
 below this. One pixel is allowed for noise."""
 
 MAX_BEHIND_FRACTION = 0.25
-"""A calibration is wrong if a larger fraction of the points than this lies behind the cameras.
-Chosen by hand."""
+"""A calibration is wrong if more than this fraction of the points lies behind the cameras. Chosen
+by hand."""
 
 MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
 """A rotation explains a disparity if its error is below MAX_ROTATION_ERROR_PX. A pair is rejected
@@ -203,10 +202,7 @@ def detect_rectification(
     offset_px: float = 0.0,
     seed: int = 0,
 ) -> Rectification:
-    """Decide from (M, 2) matches whether a pair is rectified.
-
-    `size` is the (width, height) of both images, and `offset_px` the disparity offset.
-    """
+    """Decide from (M, 2) matches whether a pair of images of one (width, height) is rectified."""
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)

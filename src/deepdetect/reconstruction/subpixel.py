@@ -26,8 +26,7 @@ MAX_SHIFT_PX = 2.0
 """A match may move by at most this distance in each of the two alignments. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
-"""A match has converged only if the correlation of its patches is at least this in the last
-step. Chosen by hand."""
+"""A match has converged only if its patches correlate at least this much. Chosen by hand."""
 
 CONVERGENCE_PX, COARSE_CONVERGENCE_PX = 0.01, 0.05
 """The first alignment ends at a step shorter than COARSE_CONVERGENCE_PX, because it only prepares
@@ -37,10 +36,9 @@ AFFINITY_WINDOW_PX = 15
 """The affinity of a patch is fitted to the matches in a window with this side. Chosen by hand."""
 
 AFFINITY_REGULARIZATION = 20.0
-"""When an affinity is fitted to the matches in a window, the similarity that is fitted to all
-matches counts as much as this number of matches, evenly spread over the window. If there are few
-matches, or all lie on one line, the affinity is therefore close to the similarity. Chosen by
-hand."""
+"""When an affinity is fitted to the matches in a window, the similarity of all matches counts as
+much as this number of matches spread over the window. An affinity that is fitted to few matches, or
+to matches on one line, is therefore close to the similarity. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES = 5000
 """The similarity is estimated from at most this number of matches, to save time."""
@@ -77,11 +75,7 @@ def refine_matches(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of the (N, 2) integer pixels that are the best corners of their cells.
-
-    The image is divided into about `count` square cells. In each, the pixel with the highest
-    Shi-Tomasi corner strength is chosen.
-    """
+    """Return one index into (N, 2) pixels for each of `count` cells: its best Shi-Tomasi corner."""
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
     side = np.sqrt(gray.size / count)
@@ -92,10 +86,7 @@ def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarr
 
 
 def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """Fit a similarity from the first image to the second robustly to matches.
-
-    Returns its rotation times its scale, (2, 2) float64.
-    """
+    """Return rotation times scale, (2, 2), of a similarity fitted robustly to all matches."""
     every = -(-len(points0) // MAX_SIMILARITY_SAMPLES)
     first, second = (
         np.ascontiguousarray(points[::every], np.float64) for points in (points0, points1)

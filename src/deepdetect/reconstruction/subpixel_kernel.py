@@ -9,10 +9,7 @@ from .._shared.kernels import compiled
 
 @compiled(nogil=True, fastmath=True, inline="always")
 def _cubic(image, x, y):  # type: ignore[no-untyped-def]
-    """Interpolate an image at (x, y) by Keys's cubic kernel, with a = -1/2.
-
-    The position must be at least 2 pixels from the border.
-    """
+    """Interpolate (Keys's cubic, a = -1/2) at (x, y), at least 2 pixels from the image border."""
     column, row = np.int64(np.floor(x)), np.int64(np.floor(y))
     u, v = np.float32(x - column), np.float32(y - row)
     a0 = ((np.float32(-0.5) * u + np.float32(1.0)) * u - np.float32(0.5)) * u

@@ -49,8 +49,7 @@ the number that the fundamental matrix explains. With a correct calibration, the
 be about equal. Chosen by hand."""
 
 MIN_IN_FRONT_FRACTION = 0.75
-"""A pose is accepted only if at least this fraction of its inliers lies in front of both cameras.
-Chosen by hand."""
+"""A pose must have this fraction of its inliers in front of both cameras. Chosen by hand."""
 
 FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
 """These multiples of the given focal length are also tried, to check it."""
@@ -60,8 +59,7 @@ MAX_FOCAL_ERROR_RATIO = 0.5
 fraction of it. A focal length that is wrong by a fifth is still accepted."""
 
 GOOD_ERROR_PX = 0.1
-"""No other focal length is tried if the median error with the given one is below this. Chosen by
-hand."""
+"""No other focal length is tried if the given one has a median error below this. Chosen by hand."""
 
 NO_DEPTH = {
     "static": "nothing moves between the images: depth needs two images from two places",
@@ -75,10 +73,7 @@ NO_DEPTH = {
 def refined_corners(
     images: tuple[np.ndarray, np.ndarray], points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matches at corners, refined to sub-pixel accuracy, as two (K, 2) arrays.
-
-    Matches whose refinement does not converge are left out.
-    """
+    """Return the matches at corners that converge to sub-pixel accuracy, as two (K, 2) arrays."""
     pixels0 = np.rint(points0)
     rows = spread_corners(images[0], pixels0, POSE_CELLS)
     refined, converged = refine_matches(*images, pixels0[rows], points1[rows])
