@@ -32,8 +32,8 @@ MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Number of matches that the minimal solver of each model needs."""
 
 MIN_PARALLAX_PX = 3.0
-"""A match is off the plane if its transfer error under the homography is at least this. Chosen on
-Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+"""A match is off the plane if its transfer error under the homography is at least this. The value
+was chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MAX_EPIPOLE_DISTANCE_PX = 1.5
 """A match off the plane agrees with an epipole if its position in the second image is closer than

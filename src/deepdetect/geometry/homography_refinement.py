@@ -34,8 +34,8 @@ from .transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
 """Each round has a side of the tracked windows in pixels, a maximum number of corners, and a number
-of pyramid levels. In the first round corners move farther, and half as many are enough. Chosen by
-hand."""
+of pyramid levels. In the first round corners move farther, and it needs only half as many. Chosen
+by hand."""
 
 MIN_TRACKS = 15
 """A homography is fitted only if there are at least this many tracks. Chosen by hand."""

@@ -31,7 +31,7 @@ START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
 starts from the one that makes the fundamental matrix most nearly essential. Chosen by hand."""
 
 MIN_MATCHES = 6
-"""Five matches determine an essential matrix; a sixth is needed to test it."""
+"""An essential matrix needs five matches, and a sixth one to test it."""
 
 FOCAL_LENGTHS = (0.7, 1.4)
 """RANSAC is run with each of these focal lengths, in units of the longer side of the image. These
