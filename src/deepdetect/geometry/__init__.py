@@ -1,4 +1,4 @@
-"""Geometry of one and two views: models, residuals, cameras, refinement, rectification."""
+"""Geometry of one and two views: models, residuals, camera poses, refinement, rectification."""
 
 from .estimation import Geometry, GeometryOptions, estimate_geometry
 from .transforms import disparity_errors, epipolar_errors, transfer_errors, transform_points

@@ -1,16 +1,17 @@
-"""Pinhole cameras, calibrations of two, and cameras with a pose.
+"""Pinhole cameras, calibrations of stereo pairs, and images with a known camera pose.
 
-A calib.json is one JSON object. Only `focal_px` is required; lengths are in pixels of images of
-`width` x `height`, with the centre of the first pixel at (0, 0)::
+The package's own camera file, such as calib.json, is one JSON object. Only `focal_px` is required.
+Focal lengths and positions are in pixels, and the centre of the first pixel is (0, 0)::
 
-    {"focal_px": 1246.7,            one number, or [fx, fy]
+    {"focal_px": 1246.7,            focal length: one number, or [fx, fy]
      "cx": 231.0, "cy": 184.5,      principal point; default: the middle of the image
-     "width": 463, "height": 370,   default: not checked
-     "baseline_mm": 160.0,          distance of the cameras; default: lengths are in baselines
-     "disparity_offset_px": 66.7,   cx of the right camera minus cx of the left; default: 0
-     "left": {...}, "right": {...}} what differs in one view: focal_px, cx, cy, width, height
+     "width": 463, "height": 370,   size of the images; if missing, it is not checked
+     "baseline_mm": 160.0,          distance between the cameras; default: unknown
+     "disparity_offset_px": 66.7,   cx right minus cx left; default: computed from the values of cx
+     "left": {...}, "right": {...}} values for one view only: focal_px, cx, cy, width, height
 
-Other keys are ignored. The names follow Middlebury 2014, where the offset is `doffs`.
+Without `baseline_mm`, lengths are in multiples of the baseline. Other keys are ignored. In the
+files of Middlebury 2014 the disparity offset is called `doffs`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from .transforms import outer_corners
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
-"""A stated disparity offset may differ by this from cx right - cx left. Chosen by hand."""
+"""A camera file may state the disparity offset as well as cx of the two cameras. The offset may
+then differ from cx of the right camera minus cx of the left by at most this. Chosen by hand."""
 
 
 @suggest_keywords
@@ -40,12 +42,12 @@ class Camera:
     """A pinhole camera.
 
     Args:
-        size: (width, height) of its image in pixels.
+        size: (width, height) of the image in pixels.
         focal_px: focal length in pixels, one number or (fx, fy).
-        centre: (cx, cy), the principal point; None is the middle of the image.
+        centre: principal point (cx, cy) in pixels. None means the middle of the image.
 
     Attributes:
-        size, focal_px, centre: the same values, all as pairs.
+        size, focal_px, centre: the same values; each is a pair.
 
     Raises:
         ReconstructionError: a value is not finite or not positive.
@@ -81,7 +83,7 @@ class Camera:
 
     @property
     def matrix(self) -> np.ndarray:
-        """The (3, 3) camera matrix."""
+        """The (3, 3) matrix of intrinsics, with focal lengths and principal point."""
         (fx, fy), (cx, cy) = self.focal_px, self.centre
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
@@ -92,7 +94,7 @@ class Camera:
         return Camera(size, (ratio * self.focal_px).tolist(), centre.tolist())
 
     def rays(self, points: np.ndarray) -> np.ndarray:
-        """Return the (N, 3) float64 rays (x, y, 1) of (N, 2) pixels in the camera's frame."""
+        """Return the (N, 3) rays (x, y, 1) through (N, 2) pixels, in the camera's frame."""
         points = numbers_of("points", points, np.float64, 2)
         directions = np.ones((len(points), 3))
         directions[:, :2] = (points - self.centre) / self.focal_px
@@ -112,7 +114,7 @@ class Calibration:
 
     Attributes:
         camera0, camera1: cameras of the left (first) and the right (second) image.
-        baseline_mm: distance between their centres. Without it (None) depths are in baselines.
+        baseline_mm: distance between their centres. If None, the unit of depth is the baseline.
         source: where the calibration comes from, such as "calib.json", "focal_px" or "EXIF".
 
     Raises:
@@ -137,25 +139,26 @@ class Calibration:
         if baseline <= 0:
             raise ReconstructionError(
                 f"the baseline must be above 0 mm, not {baseline:g}: two images from one place "
-                "have no depth; give the distance of the cameras, or leave it out"
+                "have no depth; give the distance between the cameras, or leave the baseline out"
             )
         object.__setattr__(self, "baseline_mm", baseline)
 
     @property
     def disparity_offset_px(self) -> float:
-        """Offset added to a disparity to get depth: cx of the right camera minus cx of the left."""
+        """The offset cx right minus cx left in pixels, which `depth_mm` adds to each disparity."""
         return self.camera1.centre[0] - self.camera0.centre[0]
 
     def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
-        """Return the depth for the disparities of a rectified pair.
+        """Return the depths that belong to disparities of a rectified pair.
 
-        depth = focal length * baseline / (disparity + offset), in mm or, without it, in baselines.
+        depth = focal length * baseline / (disparity + offset). The depth is in mm, or in units of
+        the baseline if `baseline_mm` is None.
 
         Args:
-            disparity_px: x in the left minus x in the right image, any shape.
+            disparity_px: x in the left image minus x in the right image, an array of any shape.
 
         Returns:
-            float64 of the same shape; infinite where disparity plus offset is not positive.
+            float64 depths of the same shape; infinite where disparity plus offset is not positive.
         """
         moved = numbers_of("disparity_px", disparity_px, np.float64) + self.disparity_offset_px
         baseline = 1.0 if self.baseline_mm is None else self.baseline_mm
@@ -173,20 +176,20 @@ class Calibration:
         *,
         views: tuple[int, int] | None = None,
     ) -> Calibration:
-        """Read a camera file: a calib.json, as above, or one of OpenCV, ROS, Kalibr and others.
+        """Read a camera file: JSON of this package, or a file of OpenCV, ROS, Kalibr and others.
 
-        The format is recognised by the content: https://github.com/deepdetect/deepdetect has a
-        table of formats in docs/files.md.
+        The format is recognised by the content. The formats are listed in docs/files.md of
+        https://github.com/deepdetect/deepdetect.
 
         Args:
-            path: the file; or a folder with the files of both cameras.
-            size0, size1: (width, height) of the images. None: as in the file.
-            views: numbers of the left and the right camera in a KITTI file. None: the colour
-                cameras, 2 and 3, or else 0 and 1.
+            path: a file, or a folder with one file for each of the two cameras.
+            size0, size1: (width, height) of the images. None takes the size from the file.
+            views: numbers of the left and the right camera in a KITTI file. None takes the colour
+                cameras 2 and 3, or the grey ones 0 and 1 if there are no others.
 
         Raises:
-            ReconstructionError: the file is missing, damaged, contradictory or of unknown format,
-                or its cameras distort or have images of another size.
+            ReconstructionError: the file is missing, damaged, contradictory or of an unknown
+                format, its cameras have lens distortion, or it is for images of another size.
         """
         with _reading(path):
             return _calibration(read_camera_file(Path(path), views), size0, size1, str(path))
@@ -197,13 +200,13 @@ class Calibration:
             if camera.size != (other := _numbers("the image size", size, 2)):
                 wanted, actual = (f"{side[0]:g}x{side[1]:g}" for side in (camera.size, other))
                 raise ReconstructionError(
-                    f"the calibration is for images of {wanted} pixels, the {name} image has "
-                    f"{actual}: give the calibration of this size"
+                    f"the calibration is for images of {wanted} pixels, but the {name} image has "
+                    f"{actual}: give a calibration for this size"
                 )
 
 
 def check_camera_file(path: str | Path) -> None:
-    """Raise a ReconstructionError if `Calibration.load` cannot read a file, whatever the images."""
+    """Raise a ReconstructionError if a camera file cannot be read; image sizes are not checked."""
     with _reading(path):
         read_camera_file(Path(path), None)
 
@@ -218,7 +221,7 @@ def _reading(path: str | Path) -> Iterator[None]:
         missing = isinstance(error, FileNotFoundError)
         kind = MissingCalibrationError if missing else ReconstructionError
         raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # the readers of these formats raise many types
+    except Exception as error:  # the readers of these formats raise exceptions of many types
         raise ReconstructionError(
             f"{path} is damaged ({first_line(error)}): correct it, or give the focal length"
         ) from None
@@ -231,7 +234,7 @@ def _calibration(
     for name in ("left", "right"):
         of_view = values.get(name, {})
         if not isinstance(of_view, dict):
-            raise ReconstructionError(f'"{name}" must be an object, such as {{"cx": 320}}')
+            raise ReconstructionError(f'"{name}" must be a JSON object, such as {{"cx": 320}}')
         together = {**values, **of_view}
         views.append({key: value for key, value in together.items() if value is not None})
     left, right = views
@@ -248,7 +251,7 @@ def _calibration(
     if offset is not None and abs(measured - offset) > MAX_OFFSET_ERROR_PX:
         raise ReconstructionError(
             f"disparity_offset_px is {offset:g}, but cx of the right view minus cx of the left "
-            f"is {measured:g}: leave one of them out"
+            f"is {measured:g}: leave out `disparity_offset_px`, or correct it"
         )
     calibration.check_sizes(size0, size1)
     return calibration
@@ -270,7 +273,7 @@ def _camera(view: dict[str, Any], size: Size) -> Camera:
 
 
 def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
-    """Return a value as `count` finite numbers; a single number is repeated."""
+    """Return a value as a tuple of `count` finite numbers; a single number is repeated."""
     try:
         numbers = np.broadcast_to(value, count).astype(np.float64, casting="same_kind")
     except (TypeError, ValueError):
@@ -284,20 +287,20 @@ def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
 def fundamental_matrix(
     calibration: Calibration, rotation: np.ndarray, translation: np.ndarray
 ) -> np.ndarray:
-    """Return the fundamental matrix of two cameras in pixels, (3, 3) with x1^T F x0 = 0."""
+    """Return F, (3, 3), with x1^T F x0 = 0 in pixels, for X1 = rotation @ X0 + translation."""
     essential = cross_matrix(translation) @ rotation
     inverse0 = np.linalg.inv(calibration.camera0.matrix)
     return np.linalg.inv(calibration.camera1.matrix).T @ essential @ inverse0
 
 
 def cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """Return the (3, 3) matrix M with M @ v = vector x v."""
+    """Return the (3, 3) matrix M for which M @ v is the cross product of `vector` and v."""
     x, y, z = np.asarray(vector, np.float64).reshape(3)
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def angles_between(vectors0: np.ndarray, vectors1: np.ndarray) -> np.ndarray:
-    """Return the angles between vectors (N, 3) in radians, accurate also for small ones."""
+    """Return the (N,) angles in radians between (N, 3) vectors; small ones are accurate as well."""
     across = np.linalg.norm(np.cross(vectors0, vectors1), axis=1)
     return np.asarray(np.arctan2(across, np.einsum("ij,ij->i", vectors0, vectors1)))
 
@@ -308,9 +311,9 @@ class PosedView:
 
     Attributes:
         name: name of the image.
-        camera: its pinhole camera, centre of the first pixel (0, 0).
-        rotation, translation: (3, 3) and (3,) float64: a point X of the world is rotation @ X +
-            translation in the camera's frame, x right, y down, z forward.
+        camera: its pinhole camera; the centre of the first pixel is (0, 0).
+        rotation, translation: (3, 3) and (3,) float64. A point X of the world has the coordinates
+            rotation @ X + translation in the camera's frame (x right, y down, z forward).
     """
 
     name: str
@@ -320,31 +323,31 @@ class PosedView:
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) float64, the position of the camera."""
+        """Position of the camera in the world, (3,) float64."""
         return np.asarray(-self.rotation.T @ self.translation)
 
     def relative_to(self, first: PosedView) -> PosedView:
-        """Return this view with the other view's camera frame as the world frame."""
+        """Return this view with the camera frame of the view `first` as the world frame."""
         rotation = self.rotation @ first.rotation.T
         return replace(
             self, rotation=rotation, translation=self.translation - rotation @ first.translation
         )
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project (N, 3) points of the world; return (N, 2) positions in pixels and (N,) depths."""
+        """Project (N, 3) points of the world; return (N, 2) pixel positions and (N,) depths."""
         seen = np.asarray(points, np.float64) @ self.rotation.T + self.translation
         return self.camera.project(seen), seen[:, 2]
 
     def corners(self, depth: float) -> np.ndarray:
-        """Return the (4, 3) corners, in the world, of the field of view at a depth."""
+        """Return the corners of the field of view at a depth, (4, 3) in the frame of the world."""
         rays = self.camera.rays(outer_corners(self.camera.size)) * depth
         return np.asarray((rays - self.translation) @ self.rotation)
 
 
 def camera_spacing(centres: np.ndarray) -> float:
-    """Return the median distance from each of (V, 3) camera centres to the nearest other one."""
-    blocks = np.array_split(centres, len(centres) // 500 + 1)  # bounds the memory
+    """Return the median distance from a camera to its nearest neighbour; `centres` is (V, 3)."""
+    blocks = np.array_split(centres, len(centres) // 500 + 1)  # the blocks bound the memory
     distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
-    second = min(1, len(centres) - 1)  # the nearest centre is the camera's own
+    second = min(1, len(centres) - 1)  # index 0 is the camera itself
     nearest = [np.partition(each, second, axis=1)[:, second] for each in distances]
     return float(np.median(np.concatenate(nearest)))

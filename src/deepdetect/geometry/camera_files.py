@@ -1,7 +1,7 @@
-"""Readers of camera files of other programs, which are recognised by their content.
+"""Readers of camera files of other programs. A format is recognised by the content of the file.
 
-They return the content of a calib.json, which `Calibration.load` documents; docs/files.md lists the
-formats.
+All readers return a dictionary with the keys of calib.json, which the module `camera` describes.
+docs/files.md lists the formats.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ STEREO = (
     *(("P1", "P2", ""), ("M1", "M2", "D"), ("K1", "K2", "D")),
     ("cameraMatrix1", "cameraMatrix2", "distCoeffs"),
 )
-"""Keys in OpenCV's files: the two camera matrices, and the prefix of the keys of their distortion
-coefficients. Projection matrices of rectified views, which have no distortion, come first."""
+"""Keys in OpenCV's files. Each row has the keys of the two camera matrices, and the beginning of
+the keys of their distortion coefficients, which end with 1 and 2. The first row is for projection
+matrices of rectified views, which have no distortion."""
 
 MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "M1", "K1", "cameraMatrix1")
 PROJECTIONS = ("projection_matrix", "P", "p")
@@ -37,16 +38,16 @@ FILES_OF_PAIRS = (
     *(("left.yaml", "right.yaml"), ("intrinsics.yml", "extrinsics.yml")),
     *(("cam0/sensor.yaml", "cam1/sensor.yaml"), ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml")),
 )
-"""Names of the two files of a stereo pair that ROS, OpenCV and EuRoC write to a folder."""
+"""Names of the two files that ROS, OpenCV or EuRoC write to a folder for a stereo pair."""
 
 MM_PER_M = 1000.0
 
 MIN_BASELINE_MM = 10.0
-"""OpenCV's files state no unit of lengths. Baselines below this are taken as metres, others as mm.
-Chosen by hand."""
+"""OpenCV's files do not state the unit of lengths. A baseline is taken to be in metres if its
+number is smaller than this, else in mm. Chosen by hand."""
 
 COLMAP_CENTRE = 0.5
-"""Coordinate of the first pixel's centre in COLMAP. In this package it is 0."""
+"""The centre of the first pixel has this x and y in COLMAP. In this package they are 0."""
 
 NUMBERS = r"([-+.\deE \t;,\[\]]+)\r?$"
 COLMAP_LINE = re.compile(rf"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]{NUMBERS}", re.MULTILINE)
@@ -59,13 +60,13 @@ KNOWN = (
 
 
 def read_camera_file(path: Path, views: tuple[int, int] | None = None) -> dict[str, Any]:
-    """Read a camera file, or a folder with two, and return the content of a calib.json.
+    """Read a camera file, or a folder with two; return a dictionary with the keys of calib.json.
 
-    If a file has several cameras, `views` are the numbers of the two that took the images.
+    `views` are the numbers of the left and the right camera in a KITTI file, which has several.
 
     Raises:
         ReconstructionError: the format is unknown, or the cameras have distortion.
-        OSError: the file cannot be read. Any other error means that it is damaged.
+        OSError: the file cannot be read. Any other exception means that the file is damaged.
     """
     if not path.is_dir():
         return _calib_json(_parsed(path.read_bytes()), views)
@@ -77,14 +78,14 @@ def read_camera_file(path: Path, views: tuple[int, int] | None = None) -> dict[s
             left, right = _calib_json(first, None), _calib_json(second, None)
             return {**left, "right": right["right"], "baseline_mm": _distance(first, second)}
     wanted = ", or ".join(" and ".join(names) for names in FILES_OF_PAIRS)
-    raise ReconstructionError(f"the folder does not hold {wanted}: give a file")
+    raise ReconstructionError(f"the folder does not contain {wanted}: give a file")
 
 
 def _parsed(content: bytes) -> Values:
-    """Parse a camera file to values by key.
+    """Parse the content of a camera file into a mapping from keys to values.
 
-    `cv2.FileStorage` is not used for OpenCV's files: it hangs on damaged ones, and deep nesting
-    crashes the process.
+    `cv2.FileStorage` is not used for OpenCV's files, because it hangs on damaged files, and deep
+    nesting makes it crash the process.
     """
     text = content.decode("utf-8", "replace").lstrip("\ufeff \r\n\t")
     if text.startswith("{"):
@@ -101,9 +102,9 @@ def _parsed(content: bytes) -> Values:
         return lines
     import yaml
 
-    Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # own class, to accept OpenCV's tags
+    Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # a subclass, to accept OpenCV's tags
     Loader.add_multi_constructor("", lambda loader, _, node: loader.construct_mapping(node, True))
-    # ROS ends its output with the start of another document, so only the first one is read.
+    # ROS ends its file with the start of a second YAML document, so only the first one is read.
     values = next(yaml.load_all(re.sub(r"\A%YAML[^\n]*\n", "", text), Loader), None)
     if not isinstance(values, dict):
         raise ReconstructionError(f"it holds no cameras: {KNOWN}")
@@ -125,7 +126,7 @@ def _xml_values(node: ElementTree.Element) -> Any:
 
 
 def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | None:
-    """Return the first matrix that has three rows and an allowed number of elements, or None."""
+    """Return the first value with an allowed number of elements, as three rows, or else None."""
     for key in keys:
         value = values.get(key)
         data = value.get("data") if isinstance(value, Mapping) else value
@@ -135,7 +136,8 @@ def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | No
 
 
 NO_PINHOLES = "fisheye", "equidistant", "equirectangular"
-"""Parts of the names of camera models that are not pinhole models, even without distortion."""
+"""A camera model whose name contains one of these words is not a pinhole model, even if all of its
+distortion coefficients are 0."""
 
 
 def _check_distortion(value: Any, model: Any) -> None:
@@ -146,13 +148,13 @@ def _check_distortion(value: Any, model: Any) -> None:
     if numbers.any():
         raise ReconstructionError(
             f"its cameras have distortion ({model} {', '.join(f'{n:g}' for n in numbers)}), which "
-            "is not supported: undistort the images, as with cv2.undistort, and give the matrix "
-            "alone"
+            "is not supported: undistort the images, for example with cv2.undistort, and give the "
+            "camera matrix without coefficients"
         )
 
 
 def _both(left: np.ndarray, right: np.ndarray, size: Any, baseline_mm: Any) -> dict[str, Any]:
-    """Return the content of a calib.json for two camera matrices."""
+    """Return a dictionary with the keys of calib.json for two camera matrices."""
     views = [
         {"focal_px": [float(m[0, 0]), float(m[1, 1])], "cx": float(m[0, 2]), "cy": float(m[1, 2])}
         for m in (left, right)
@@ -163,17 +165,17 @@ def _both(left: np.ndarray, right: np.ndarray, size: Any, baseline_mm: Any) -> d
 
 
 def _metres(left: np.ndarray, right: np.ndarray) -> float | None:
-    """Return the distance between the cameras of two projection matrices, or None."""
+    """Return the distance between the cameras of two projection matrices; None if not known."""
     if left.shape[1] < 4 or right.shape[1] < 4:
         return None
     distance = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
     if distance < 0:
-        raise ReconstructionError("its second camera is to the left of its first: swap them")
+        raise ReconstructionError("its second camera is to the left of its first: swap the two")
     return distance or None
 
 
 def _distance(first: Values, second: Values) -> float | None:
-    """Return the baseline in mm from two poses (EuRoC) or projection matrices (ROS)."""
+    """Return the baseline in mm from two camera poses (EuRoC) or two projection matrices (ROS)."""
     if "T_BS" in first and "T_BS" in second:
         left, right = (np.reshape(each["T_BS"]["data"], (4, 4))[:3, 3] for each in (first, second))
         return float(np.linalg.norm(left - right)) * MM_PER_M
@@ -190,7 +192,7 @@ def _calib_json(values: Values, views: tuple[int, int] | None) -> dict[str, Any]
         if (found := read(values, views)) is not None:
             return found
     keys = ", ".join(map(str, [*values][:5]))
-    raise ReconstructionError(f"it has no cameras in a known format, but {keys}: {KNOWN}")
+    raise ReconstructionError(f"it has no cameras in a known format, only the keys {keys}: {KNOWN}")
 
 
 def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
@@ -202,7 +204,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
     made = []
     for model, (width, height, *numbers) in cameras:
         _check_distortion(0, model)
-        if model.startswith(("SIMPLE_", "RADIAL")):  # these models have one focal length
+        if model.startswith(("SIMPLE_", "RADIAL")):  # these models have a single focal length
             numbers.insert(0, numbers[0])
         fx, fy, cx, cy, *distortion = numbers
         _check_distortion(distortion, model)
@@ -213,7 +215,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _kitti(values: Values, views: tuple[int, int] | None) -> dict[str, Any] | None:
-    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to _03 (raw data); 2 and 3 are in colour."""
+    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw); 2 and 3 are in colour."""
     for start in ("P", "P_rect_0"):
         for pair in (views or (2, 3), (2, 3), (0, 1)):
             left, right = (_matrix(values, [f"{start}{view}"], 12) for view in pair)
@@ -234,7 +236,7 @@ def _middlebury(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
-    """Read a camera chain of Kalibr, or a single camera such as a sensor.yaml of EuRoC."""
+    """Read a camera chain of Kalibr, or a file with one camera, such as EuRoC's sensor.yaml."""
     cameras = [each for key in ("cam0", "cam1") if isinstance(each := values.get(key), Mapping)]
     matrices = []
     for camera in cameras or [values]:
@@ -254,7 +256,7 @@ def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _opencv(values: Values, _: Any) -> dict[str, Any] | None:
-    """Read files of OpenCV and ROS; with distortion they must also hold the rectified cameras."""
+    """Read a file of OpenCV or ROS; if it has distortion, it also needs rectified projections."""
     for first, second, distortion in STEREO:
         left, right = (_matrix(values, [key], 9, 12) for key in (first, second))
         if left is not None and right is not None:

@@ -1,13 +1,14 @@
-"""Rectification of two views by their fundamental matrix: epipolar lines become rows.
+"""Rectify two views by their fundamental matrix, so that epipolar lines become rows.
 
-There are two frames, for two kinds of motion. `PlanarFrame` warps each view by a homography
-(Hartley, "Theory and practice of projective rectification", 1999); it suits cameras side by side.
-`PolarFrame` has a row for each direction from the epipole (Pollefeys, Koch and Van Gool, "A simple
-and efficient rectification method for general motion", 1999), and works wherever the epipole lies,
-also in the image. Its columns are logarithms of the distance from the epipole: if a camera moves
-forward, everything grows about the epipole, and growth by a factor is a shift.
+There are two kinds of rectified frames, for two kinds of motion. `PlanarFrame` warps each view by a
+homography (Hartley, "Theory and practice of projective rectification", 1999). It suits cameras side
+by side. `PolarFrame` has one row for each direction from the epipole (Pollefeys, Koch and Van Gool,
+"A simple and efficient rectification method for general motion", 1999). It also works if the
+epipole lies in the image. Its columns are spaced by the logarithm of the distance from the epipole.
+If a camera moves forward, the image is magnified about the epipole, and in this frame a
+magnification by a factor is a shift by a number of columns.
 
-In both frames the match of (x, y) in the first view is (x - disparity, y) in the second.
+In both frames the match of (x, y) in the first rectified view is (x - disparity, y) in the second.
 """
 
 from __future__ import annotations
@@ -23,30 +24,34 @@ from .transforms import transform_points, translation_matrix
 Both = tuple[np.ndarray, np.ndarray]
 
 MAX_STRETCH = 2.0
-"""Maximum scale of any part of a view in a planar frame, relative to its middle, along the line
-that is mapped to infinity; across this line the square is allowed. Beyond it the frame is polar.
-This value and the next three were chosen on Oxford, Middlebury, Strecha's fountain and KITTI."""
+"""A planar frame may enlarge or reduce any part of a view by at most this factor, relative to the
+middle of the matches. The factor holds parallel to the line that is mapped to infinity; across this
+line its square is allowed. A view that needs a larger factor gets a polar frame. Chosen on Oxford,
+Middlebury, Strecha's fountain and KITTI."""
 
 MAX_AREA = 3.0
-"""Maximum area of a planar frame, relative to the larger view."""
+"""Maximum area of a planar frame, relative to the larger view. Chosen like `MAX_STRETCH`."""
 
 RESOLVED_QUANTILE = 0.6
-"""A polar frame has the resolution of the first view at one distance from the epipole: this
-quantile of all pixels' distances. Nearer pixels are enlarged, farther ones reduced."""
+"""A polar frame has the resolution of the first view at one distance from the epipole. What is
+nearer is enlarged, and what is farther is reduced. That distance is this quantile of the distances
+of all pixels of the view. Chosen like `MAX_STRETCH`."""
 
 MIN_RADIUS_PX = 8.0
-"""Pixels nearer to the epipole than this are not rectified, because nothing moves there."""
+"""A polar frame leaves out pixels nearer to the epipole than this, because hardly anything moves
+there. Chosen like `MAX_STRETCH`."""
 
 MAX_SIDE_PX = 2**15 - 2
-"""Maximum side of a frame: OpenCV cannot warp to a larger one."""
+"""Maximum width and height of a frame, because OpenCV cannot warp to a larger one."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarFrame:
-    """Two views rectified by homographies, (3, 3) each, that map their pixels to the frame.
+    """A frame to which each of two views is rectified by a homography.
 
-    `size` is (width, height); `view` is 0 for the first view and 1 for the second. Content beyond
-    the horizon of a homography is not shown.
+    `homographies` are the (3, 3) matrices that map the pixels of each view to the frame, and `size`
+    is its (width, height). In the methods, `view` is 0 for the first view and 1 for the second.
+    Parts of a view beyond the line that its homography maps to infinity are not shown.
     """
 
     homographies: tuple[np.ndarray, np.ndarray]
@@ -65,7 +70,8 @@ class PlanarFrame:
         matrix = self.homographies[view]
         whole = np.full(image.shape[:2], 255, np.uint8)
         shown = cv2.warpPerspective(whole, matrix, self.size, flags=cv2.INTER_NEAREST) > 0
-        inverse = np.linalg.inv(matrix) * np.linalg.det(matrix)  # positive before the horizon
+        # This sign makes `inverse[2] @ (x, y, 1)` positive on the visible side of the horizon.
+        inverse = np.linalg.inv(matrix) * np.linalg.det(matrix)
         x, y = (np.arange(length) for length in self.size)
         shown &= inverse[2, 0] * x + inverse[2, 1] * y[:, None] + inverse[2, 2] > 0
         return cv2.warpPerspective(image, matrix, self.size, flags=cv2.INTER_LANCZOS4), shown
@@ -73,13 +79,16 @@ class PlanarFrame:
 
 @dataclass(frozen=True, eq=False)
 class PolarFrame:
-    """Two views rectified about their epipoles; for the methods see `PlanarFrame`.
+    """A frame to which two views are rectified about their epipoles, in polar coordinates.
 
-    The orientation, 1 or -1, says which half of an epipolar line in the second view corresponds to
-    a half in the first. `middle` is the angle of the middle row in the first view, `first_angle`
-    the angle of the first row minus `middle`, and `min_radius_px` the radius of the first column.
-    From row to row the angle grows by `step` radians, from column to column the natural logarithm
-    of the radius by `step`. A homography `plane` first warps the second view to the first.
+    The methods are those of `PlanarFrame`. The `orientation`, 1 or -1, tells which half of an
+    epipolar line in the second view corresponds to a half of a line in the first view. Angles are
+    those about the epipole of the first view, in radians: `middle` is the direction of the centre
+    of the view (0 if the epipole lies in the view), and `first_angle` is the angle of the first row
+    minus `middle`. `min_radius_px` is the distance of the first column from the epipole. From row
+    to row, the angle grows by `step`. From column to column, the natural logarithm of the distance
+    grows by `step`. If there is a homography `plane` from the first view to the second, the second
+    view is first warped by its inverse.
     """
 
     fundamental: np.ndarray
@@ -93,12 +102,12 @@ class PolarFrame:
     plane: np.ndarray | None = None
 
     def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
-        """Map positions of a view to the frame; a position at the epipole becomes infinite."""
+        """Map (N, 2) positions of a view to the frame; the epipole is mapped to infinity."""
         if view and self.plane is not None:
             points = transform_points(points, np.linalg.inv(self.plane))
         offset = np.asarray(points, np.float64).reshape(-1, 2) - self.epipoles[view]
         angle = np.arctan2(offset[:, 1], offset[:, 0])
-        if view:  # the direction in the first view whose epipolar line this point lies on
+        if view:  # the angle in the first view of the epipolar line on which the point lies
             lines = np.column_stack([points, np.ones(len(offset))]) @ self.fundamental
             angle = np.arctan2(-lines[:, 0], lines[:, 1])
             same = (self._directions(angle, 1) * offset).sum(axis=1) > 0
@@ -109,12 +118,12 @@ class PolarFrame:
         return np.column_stack([radius, relative - self.first_angle]) / self.step
 
     def from_frame(self, points: np.ndarray, view: int) -> np.ndarray:
-        """Map positions of the frame to a view."""
+        """Map (N, 2) positions of the frame to a view."""
         column, row = np.asarray(points, np.float64).reshape(-1, 2).T
         return self._positions(column, row, view)
 
     def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Warp a view into the frame."""
+        """Warp a view into the frame; return the image and the (H, W) bool mask of valid pixels."""
         width, height = self.size
         places = self._positions(np.arange(width)[None], np.arange(height)[:, None], view)
         places = places.astype(np.float32)
@@ -124,7 +133,7 @@ class PolarFrame:
         return cv2.remap(image, places, None, cv2.INTER_LANCZOS4, borderMode=border), shown
 
     def _positions(self, column: np.ndarray, row: np.ndarray, view: int) -> np.ndarray:
-        """Map columns and rows of the frame, broadcast together, to a view, (..., 2)."""
+        """Map columns and rows of the frame, broadcast together, to (..., 2) view positions."""
         angles = self.middle + self.first_angle + row * self.step
         directions = self._directions(angles.ravel(), view).reshape(*row.shape, 2)
         radius = self.min_radius_px * np.exp(column * self.step)
@@ -137,7 +146,7 @@ class PolarFrame:
         first = np.column_stack([np.cos(angles), np.sin(angles)])
         if not view:
             return first
-        # All points in this direction have the epipolar line of the point at infinity.
+        # All points in a direction have the same epipolar line as the point at infinity there.
         lines = first @ self.fundamental[:, :2].T
         along = self.orientation * np.column_stack([lines[:, 1], -lines[:, 0]])
         return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
@@ -156,9 +165,10 @@ def rectified_frame(
 ) -> RectifiedFrame | None:
     """Choose a frame in which (N, 2) matches that fit a fundamental matrix lie on rows.
 
-    The frame is planar if this distorts the views little, otherwise polar. None if neither is
-    possible. Sizes are (width, height). If the homography of a plane in the scene is given, the
-    second view is first warped to the first by it, so that the slant of the plane disappears.
+    The frame is planar if that distorts the views little, otherwise polar. The result is None if
+    neither is possible or there are fewer than eight matches. Sizes are (width, height). `plane`
+    may be the homography of a plane in the scene, from the first view to the second. It is used to
+    first warp the second view to the first, which removes the slant of the plane.
     """
     if plane is not None:
         shown = transform_points(points1, np.linalg.inv(plane))
@@ -192,8 +202,8 @@ def _planar_frame(
     areas = np.linalg.det(jacobians)
     if areas.min() <= 0:
         return None
-    scale = 1 / np.sqrt(areas[0])  # the first view keeps its size
-    if jacobians[0][0, 0] < 0:  # upside down
+    scale = 1 / np.sqrt(areas[0])  # the first view keeps its scale
+    if jacobians[0][0, 0] < 0:  # the first view would be upside down
         scale = -scale
     first, second = (np.diag([scale, scale, 1]) @ matrix for matrix in matrices)
     moved = transform_points(points[0], first) - transform_points(points[1], second)
@@ -211,7 +221,7 @@ def _planar_frame(
 def _polar_frame(
     points: Both, fundamental: np.ndarray, sizes: tuple[Size, Size]
 ) -> PolarFrame | None:
-    """Rectify about the epipoles, or return None if one lies at infinity."""
+    """Rectify about the epipoles, or return None if one of them lies at infinity."""
     left, _, right = np.linalg.svd(fundamental)
     if min(abs(right[2, 2]), abs(left[2, 2])) < 1e-12:
         return None
@@ -237,7 +247,7 @@ def _polar_frame(
     width = int(np.ceil(np.log(farthest / nearest) / step)) + 1
     size = width, int(np.ceil((last_angle - first_angle) / step)) + 1
     frame = PolarFrame(fundamental, epipoles, 1.0, middle, first_angle, step, nearest, size)
-    # The half-line on which the matches lie gives the orientation.
+    # The orientation is that of the half-lines on which most of the matches lie.
     angles = np.arctan2(*(points[0] - epipoles[0]).T[::-1])
     along = (frame._directions(angles, 1) * (points[1] - epipoles[1])).sum(axis=1)
     return frame if np.median(np.sign(along)) >= 0 else replace(frame, orientation=-1.0)

@@ -22,33 +22,38 @@ from .transforms import epipolar_errors, transfer_errors, transform_points
 MODEL_NAMES = ("auto", "homography", "fundamental", "essential")
 
 MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
-"""Minimum number of matches. For a fundamental matrix OpenCV ignores the threshold below 15."""
+"""Minimum number of matches for each model. It is 15 for a fundamental matrix, because OpenCV
+ignores the inlier threshold if there are fewer."""
 
 MAX_LOG10_NFA = -6.0
-"""A geometry is accepted below this log10 of its number of false alarms. Chosen by hand."""
+"""A geometry is trusted if log10 of its number of false alarms is below this. Chosen by hand."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
-"""Number of matches that a minimal solver needs."""
+"""Number of matches that the minimal solver of each model needs."""
 
 MIN_PARALLAX_PX = 3.0
-"""Matches with at least this transfer error, in pixels, are off the plane. This value and the next
-three were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+"""A match is off the plane if its transfer error under the homography is at least this. The value
+was chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MAX_EPIPOLE_DISTANCE_PX = 1.5
-"""A match off the plane agrees with an epipole if it lies this near to its line through it."""
+"""A match off the plane agrees with an epipole if its position in the second image is closer than
+this to the line through the epipole and the predicted position. Chosen like `MIN_PARALLAX_PX`."""
 
 MIN_FRACTION_OF_PLANE = 0.2
-"""The scene has depth if the number of matches that agree on an epipole is at least this fraction
-of the number on the plane. Repeated patterns and moved objects give fewer."""
+"""A scene has depth only if the number of matches that agree on an epipole is at least this
+fraction of the number on the plane. Repeated patterns and moved objects give fewer. Chosen like
+`MIN_PARALLAX_PX`."""
 
 MIN_FRACTION_OF_REST = 0.5
-"""Without other evidence, this fraction of the matches off the plane must also agree."""
+"""If nothing else shows that a scene has depth, at least this fraction of the matches off the plane
+must agree on an epipole. Chosen like `MIN_PARALLAX_PX`."""
 
 MAX_MATCHES = 2000
-"""Maximum number of matches off the plane; more are sampled at random. Chosen by hand."""
+"""`measure_parallax` uses at most this many random matches off the plane. Chosen by hand."""
 
 SAMPLES = 1000
-"""Number of random pairs of matches whose lines are intersected. Chosen by hand."""
+"""Number of candidate epipoles. Each is the intersection of the lines that two random matches give,
+from the predicted to the actual position. Chosen by hand."""
 
 
 @suggest_keywords
@@ -57,14 +62,14 @@ class GeometryOptions:
     """How a geometry is estimated.
 
     Attributes:
-        inlier_threshold: a match is an inlier if its error is below this, in pixels: the transfer
-            error of a homography, else the Sampson distance (in a rectified pair an error of d rows
-            counts as d / sqrt(2)).
-        homography: a known (3, 3) homography: nothing is estimated, and the inliers are the matches
-            with a transfer error below the threshold.
+        inlier_threshold: a match is an inlier if its error is below this, in pixels. The error is
+            the transfer error of a homography, or the Sampson distance of other models, which is
+            d / sqrt(2) for a match of a rectified pair that is d rows off.
+        homography: a known (3, 3) homography. It is then not estimated, and the inliers are the
+            matches with a transfer error below the threshold.
         camera0, camera1: (3, 3) camera matrices, for the model "essential".
-        confidence: desired probability that the model is the best one.
-        iterations: maximum number of iterations.
+        confidence: RANSAC stops when, with this probability, a sample was free of outliers.
+        iterations: maximum number of samples that RANSAC draws.
 
     Raises:
         OptionError: a value is unknown, missing or out of its range.
@@ -95,7 +100,7 @@ def _matrix(name: str, value: Any) -> np.ndarray:
         raise OptionError(f"{name} must be a (3, 3) matrix of finite numbers")
     if name != "homography" and (np.linalg.matrix_rank(matrix) < 3 or matrix[0, 0] <= 0):
         raise OptionError(
-            f"{name} is not a camera matrix: it must be invertible, with a focal length above 0"
+            f"{name} is not a camera matrix: it must be invertible and have a focal length above 0"
         )
     return matrix
 
@@ -107,8 +112,9 @@ class Geometry:
     Attributes:
         model: "homography", "fundamental" or "essential".
         matrix: (3, 3) float64, or None if the estimation failed. A homography maps the first image
-            to the second; for the others x1^T M x0 = 0 (essential: in normalised coordinates).
-        inliers: (M,) bool, the matches that agree with it.
+            to the second. For the other models x1^T M x0 = 0, where an essential matrix takes
+            normalised coordinates (rays), not pixels.
+        inliers: (M,) bool, True for the matches that agree with the matrix.
     """
 
     model: str
@@ -126,11 +132,11 @@ class MatchedPoints(Protocol):
 
     @property
     def points0(self) -> np.ndarray:
-        """Positions in the first image."""
+        """The (M, 2) positions in the first image."""
 
     @property
     def points1(self) -> np.ndarray:
-        """Positions in the second image."""
+        """The (M, 2) positions in the second image."""
 
 
 @suggest_keywords
@@ -145,13 +151,14 @@ def estimate_geometry(
     """Estimate the geometry between two images from matches, some of which are wrong.
 
     Args:
-        matches: `Matches`, or (M, 2) positions in the first image, centre of the first pixel
-            (0, 0).
-        points1: (M, 2) matching positions in the second image; None with `Matches`.
-        model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto" (one
-            of these two, by the parallax of the matches), or "essential" (known cameras).
+        matches: `Matches`, or (M, 2) positions in the first image, where the centre of the first
+            pixel is (0, 0).
+        points1: (M, 2) matching positions in the second image; None if `matches` has them.
+        model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto" (the
+            one of these two that the parallax of the matches suggests), or "essential" (any static
+            scene, known cameras).
         seed: seed of the random samples.
-        options: threshold, cameras and limits of the estimation.
+        options: inlier threshold, camera matrices, and limits of the estimation.
 
     Returns:
         The geometry; its inliers are the matches with an error below the threshold. If there are
@@ -216,7 +223,7 @@ def estimate_geometry(
 
 
 def check_model(model: str, seed: int, options: GeometryOptions) -> None:
-    """Raise the OptionErrors of `estimate_geometry` that do not depend on the matches."""
+    """Raise an OptionError if the model, the seed or the options for it are not valid."""
     check_name("model", model, MODEL_NAMES)
     check_seed(seed)
     if model == "essential":
@@ -226,13 +233,13 @@ def check_model(model: str, seed: int, options: GeometryOptions) -> None:
 def check_seed(seed: int) -> None:
     """Raise an OptionError for a seed that OpenCV does not accept."""
     if not (isinstance(seed, Integral) and 0 <= seed < 2**31):
-        raise OptionError(f"the seed must lie in [0, 2147483647] and be whole, not {seed}")
+        raise OptionError(f"the seed must be a whole number from 0 to 2147483647, not {seed}")
 
 
 def _fit(
     points0: np.ndarray, points1: np.ndarray, model: str, options: GeometryOptions
 ) -> np.ndarray | None:
-    """Fit a model by MAGSAC; None, or a malformed matrix, if that fails."""
+    """Fit a model by MAGSAC. If that fails, the result is None or a matrix of a wrong shape."""
     threshold, confidence = options.inlier_threshold, options.confidence
     iterations = int(options.iterations)
     if model == "homography":
@@ -264,10 +271,11 @@ def fit_essential(
     confidence: float,
     iterations: int,
 ) -> np.ndarray | None:
-    """Fit an essential matrix to (N, 3) directions (x, y, 1); None or malformed if that fails.
+    """Fit an essential matrix by MAGSAC to (N, 3) rays (x, y, 1) in the frames of the two cameras.
 
-    OpenCV gets them as pixels of one camera, because its MAGSAC (version 5) is less accurate in
-    normalised coordinates.
+    If that fails, the result is None or a matrix of a wrong shape. OpenCV gets the rays as pixels
+    of a camera with the focal length `focal_px`, because its MAGSAC (in OpenCV 5) is less accurate
+    in normalised coordinates.
     """
     matrix, _ = cv2.findEssentialMat(
         np.ascontiguousarray(rays0[:, :2] * focal_px),
@@ -297,15 +305,16 @@ def log10_nfa(
     image_size: tuple[int, int],
     models_per_sample: int = 1,
 ) -> float:
-    """Return the decimal logarithm of the number of false alarms, infinite with too few inliers.
+    """Return the decimal logarithm of the number of false alarms (NFA) of a model.
 
-    `inliers` is (M,) bool: the matches within the threshold, in pixels of the second image, whose
-    size is (width, height). `models_per_sample` models were tried for each minimal sample.
+    `inliers` is (M,) bool: the matches with an error below `inlier_threshold`, in pixels.
+    `image_size` is (width, height) of the second image. For each minimal sample,
+    `models_per_sample` models were tried. The result is infinite if there are too few inliers.
     """
     width, height = image_size
     if model == "homography":
         chance = pi * inlier_threshold**2 / (width * height)
-    else:  # a band along a line through the image
+    else:  # area of a band along an epipolar line across the image
         chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
     agreeing = int(np.count_nonzero(inliers))
     sample_size = MINIMAL_SAMPLE_SIZE[model]
@@ -330,10 +339,12 @@ def _log_binomial(count: int, chosen: int) -> float:
 class Parallax:
     """How many matches lie off a plane, and how many of them agree on an epipole.
 
-    Matches of a static scene that a homography does not explain move along lines through the
-    epipole (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane",
-    2005). Wrong matches move anywhere, and those of a repeated pattern in one direction, but they
-    are few compared with those on the plane. `log10_nfa` tells how likely the agreement is chance.
+    If a homography does not explain a correct match of a static scene, the match is displaced from
+    the predicted position along a line through the epipole (Chum, Werner and Matas, "Two-view
+    geometry estimation unaffected by a dominant plane", 2005). Wrong matches are displaced in any
+    direction. Those of a repeated pattern are all displaced in one direction, but they are few
+    compared with the matches on the plane. `log10_nfa` is the log10 of the number of false alarms:
+    the lower it is, the less likely the agreement is due to chance.
     """
 
     on_plane: int
@@ -343,27 +354,28 @@ class Parallax:
 
     @property
     def significant(self) -> bool:
-        """Whether more matches agree on the epipole than chance explains."""
+        """Whether more matches agree on an epipole than chance explains."""
         return self.log10_nfa < MAX_LOG10_NFA
 
     def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether `significant`, and at least this fraction of the number on the plane agree."""
+        """Whether `significant`, and `agreeing` is at least this fraction of `on_plane`."""
         return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property
     def shows_depth(self) -> bool:
-        """Whether these matches alone show that the scene has depth."""
+        """Whether the matches off the plane alone show that the scene has depth."""
         most = self.agreeing >= MIN_FRACTION_OF_REST * self.off_plane
         return most and self.exceeds(MIN_FRACTION_OF_PLANE)
 
 
 @dataclass(frozen=True, eq=False)
 class TwoViewModel(Geometry):
-    """A geometry with its evidence. The model is "none" if the estimation failed.
+    """A geometry, and the evidence for it. The model is "none" if the estimation failed.
 
     Attributes:
-        log10_nfa: decimal logarithm of its number of false alarms.
-        parallax: of the matches off the homography, if the model was chosen automatically.
+        log10_nfa: decimal logarithm of the number of false alarms of the geometry.
+        parallax: parallax of the matches that the homography does not explain. None if it was not
+            measured; it is measured for a trusted homography if the model is "auto".
     """
 
     log10_nfa: float
@@ -378,7 +390,7 @@ class TwoViewModel(Geometry):
 def measure_parallax(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, seed: int = 0
 ) -> Parallax:
-    """Look for an epipole among the (M, 2) matches that a homography does not explain."""
+    """Find an epipole on which those (M, 2) matches agree that are off the homography's plane."""
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX
     on_plane = len(off) - int(np.count_nonzero(off))
@@ -394,7 +406,7 @@ def measure_parallax(
         drawn = random.choice(off_plane, MAX_MATCHES, replace=False)
         predicted, actual = predicted[drawn], actual[drawn]
     low, size = points1.min(axis=0), np.ptp(points1, axis=0)
-    if not size.all():  # all on one row or column
+    if not size.all():  # all positions lie on one row or in one column
         return nothing
     scale = float(size.max())
     first, second = (
@@ -416,7 +428,7 @@ def measure_parallax(
 
 
 def _misses(epipoles: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the distances of N points from the lines through E epipoles and the predictions."""
+    """Return the (E, N) distances of points from the lines through epipoles and predictions."""
     x, y, scale = epipoles.T[:, :, None]
     normal = np.hypot(y - scale * first[:, 1], scale * first[:, 0] - x)
     return np.abs(epipoles @ np.cross(first, second).T) / np.maximum(normal, 1e-12)

@@ -1,11 +1,12 @@
-"""Refinement of a homography by the image content, each step cross-validated.
+"""Refine a homography by the content of the two images; each step is cross-validated.
 
-First, corners are tracked between the first image and the warped second one, forward and back, and
-a homography is fitted to the tracks. Then all pixels of a smaller copy are aligned (Evangelidis and
-Psarakis, "Parametric image alignment using enhanced correlation coefficient maximization", 2008).
-For validation, a chessboard pattern divides the image into two halves, and a correction is fitted
-to each. A step is kept only if more windows match better than worse when each half is warped by the
-correction fitted to the other. All of this takes a fraction of a second.
+In two rounds, corners of the first image are tracked to the warped second image and back, and a
+homography is fitted to the tracks. In the last step, all pixels of reduced copies are aligned
+(Evangelidis and Psarakis, "Parametric image alignment using enhanced correlation coefficient
+maximization", 2008). For cross-validation, the black and the white squares of a chessboard divide
+the image into two halves. A correction of the homography is fitted to each half, and used to warp
+the other half. The step is kept only if this improves more windows than it worsens. All of this
+takes a fraction of a second.
 """
 
 from __future__ import annotations
@@ -32,47 +33,51 @@ from .images import (
 from .transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
-"""Side of the tracked windows in pixels, number of corners, and levels of the pyramid, for each
-round. The first round has larger motion and needs only half as many corners. Chosen by hand."""
+"""Each round has a side of the tracked windows in pixels, a maximum number of corners, and a number
+of pyramid levels. In the first round corners move farther, and it needs only half as many. Chosen
+by hand."""
 
 MIN_TRACKS = 15
-"""Minimum number of tracks to which a homography is fitted. Chosen by hand."""
+"""A homography is fitted only if there are at least this many tracks. Chosen by hand."""
 
 TRACKING_ITERATIONS = 15
 TRACKING_STEP_PX = 0.02
-"""A track that moves by less than this has converged. Chosen by hand."""
+"""A corner has converged when a tracking step moves it by less than this. Chosen by hand."""
 
 MAX_ROUND_TRIP_PX = 0.3
-"""A track, forward and back, is kept if it ends this near to its start. Chosen by hand."""
+"""A corner is tracked to the second image and back. The track is kept if it ends at less than this
+distance from its start. Chosen by hand."""
 
 CAUCHY_SCALE_PX = 1.0
-"""A track with this residual has half the weight of an exact one. Chosen by hand."""
+"""A track with this residual has half the weight of one without residual. Chosen by hand."""
 
 IRLS_ITERATIONS = 30
 
 ALIGNMENT_SIDE_PX = 480
-"""Images are reduced to this longer side for the alignment of all pixels. Chosen by hand."""
+"""Images are reduced to this longer side before their pixels are aligned. Chosen by hand."""
 
 ALIGNMENT_SIGMA_PX = 1.0
-"""Sigma of the blur of these copies. Chosen by hand."""
+"""The reduced copies are blurred with this sigma before they are aligned. Chosen by hand."""
 
 ALIGNMENT_ITERATIONS = 15
 
 SQUARES = 8
-"""Number of squares along the longer side of the image. Chosen by hand."""
+"""Number of squares of the chessboard along the longer side of a large image. Chosen by hand."""
 
 STEP_PX = WINDOW_PX // 3
-"""Distance between the windows in which images are compared. Chosen by hand."""
+"""Distance between the centres of the windows in which images are compared. Chosen by hand."""
 
 Fit = Callable[[np.ndarray], "np.ndarray | None"]
-"""A function from the (H, W) bool mask of usable pixels to a (3, 3) correction or None."""
+"""A function that fits a (3, 3) correction of a homography to the pixels in an (H, W) bool mask. It
+returns None if the fit fails."""
 
 
 def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Refine a homography by two grey images; see the module for how each step is validated.
+    """Refine the homography from the first of two grey images to the second.
 
-    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. If no step
-    improves it, it is returned unchanged, apart from its scale: the last element is 1.
+    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. The
+    docstring of the module tells how each step is validated. If no step improves the homography, it
+    is returned unchanged except for its scale: the last element of the result is always 1.
     """
     size = (gray0.shape[1], gray0.shape[0])
     blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)
@@ -89,7 +94,8 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
     steps.append(partial(_fit_to_pixels, gray0))
     current = np.asarray(homography, np.float64)
     for step in steps:
-        # Corners need detail, which linear interpolation loses if scales differ.
+        # Tracking corners needs detail, which linear interpolation loses if the scales differ. Only
+        # the last step, which aligns all pixels, uses linear interpolation.
         warp = partial(warp_to_reference, exact=step is steps[-1])
         warped, valid_mask = warp(gray1, current, size)
         fit = step(warped, valid_mask)
@@ -101,8 +107,8 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         np.copyto(mixed, other, where=half)
         np.copyto(mixed_mask, other_mask, where=half)
         gain = correlation(mixed, mixed_mask) - correlation(warped, valid_mask)
-        # The number of windows that get better is compared with the number that get worse. A mean
-        # would also rise for a compromise between a plane and objects off the plane.
+        # The number of windows that improve is compared with the number that get worse. The mean
+        # correlation would also rise for a compromise between a plane and objects off the plane.
         gain = gain[inner & np.isfinite(gain)]
         correction = fit(valid_mask) if np.sign(gain).sum() > 0 else None
         if correction is not None:
@@ -113,7 +119,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
 def most_alike(
     gray0: np.ndarray, gray1: np.ndarray, homographies: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Return the homography under which small copies of two images correlate best."""
+    """Return the homography under which reduced copies of two images correlate best."""
     (first, scale0), (second, scale1) = (downscale(g, ALIGNMENT_SIDE_PX) for g in (gray0, gray1))
 
     def correlation(homography: np.ndarray) -> float:
@@ -130,10 +136,11 @@ def _fit_to_corners(
     warped: np.ndarray,
     valid_mask: np.ndarray,
 ) -> Fit:
-    """Track corners, and return the fit to those in a part of the image.
+    """Track corners, and return a function that fits a homography to those in a part of the image.
 
-    Weighted least squares is accurate on most of an image even if no homography fits all of it, as
-    with lens distortion. The result of RANSAC would then differ with each random sample.
+    The fit is by weighted least squares, which is accurate on most of an image even if no
+    homography fits all of it, for example because of lens distortion. RANSAC would then give
+    another result for each random sample.
     """
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
@@ -179,7 +186,7 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
             correction = cv2.findTransformECC(
                 *normalised, start, cv2.MOTION_HOMOGRAPHY, criteria, mask, 1
             )[1]
-        except cv2.error:  # no convergence, or nothing to correlate
+        except cv2.error:  # the alignment does not converge, or there is nothing to correlate
             return None
         return scaled_homography(correction.astype(np.float64), 1 / scale, 1 / scale)
 
@@ -187,9 +194,10 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
 
 
 def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
-    """Fit a homography by iteratively reweighted least squares with Cauchy weights.
+    """Fit a homography to (N, 2) points by iteratively reweighted least squares (Cauchy weights).
 
-    The last element of the result is 1. None if the points do not determine a homography.
+    The last element of the result is 1. The result is None if the points do not determine a
+    homography.
     """
     middle = points0.mean(axis=0)
     spread = float(np.abs(points0 - middle).mean())
@@ -225,8 +233,9 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
 def _halves(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Divide an image of (width, height) into the squares of a chessboard.
 
-    Returns which pixels lie on squares of the second colour, (H, W) bool, and whether the blurred
-    windows of `local_zncc` lie within their squares, (H // STEP_PX, W // STEP_PX) bool.
+    Returns two bool masks. The first, (H, W), is True for pixels on squares of the second colour.
+    The second, (H // STEP_PX, W // STEP_PX), is True for those windows of `local_zncc` that lie
+    within one square, with a margin for the blur.
     """
     margin = WINDOW_PX // 2 + int(np.ceil(3 * BLUR_SIGMA_PX))
     side = max(max(size) / SQUARES, 4 * margin)

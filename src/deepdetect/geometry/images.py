@@ -1,4 +1,4 @@
-"""Scaling, warping, correlation and tracking of images, and sums over windows."""
+"""Scale, warp, correlate and track images, and sum values over windows of pixels."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
 ANTIALIASING_SIGMA = 0.5
-"""Blur before downscaling: sigma = this times sqrt(1 / scale^2 - 1) pixels. Chosen by hand."""
+"""The blur before downscaling has a sigma of this times sqrt(1 / scale^2 - 1). Chosen by hand."""
 
 WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25
-"""Sigma of the blur before images are compared, against noise and resampling. Chosen by hand."""
+"""Images are blurred by this sigma against noise before they are compared. Chosen by hand."""
 
 NOISE_STD = 2.0
-"""This many grey levels are added to a window's standard deviation before it divides, so that
-noise is not amplified. Chosen by hand."""
+"""`normalise_local_contrast` adds the square of this number of grey levels to the variance of each
+window, so that noise is not amplified in flat windows. Chosen by hand."""
 
 MAX_UNKNOWN_WEIGHT = 1e-3
-"""Maximum weight of pixels without data in an interpolated pixel. Chosen by hand."""
+"""Maximum total weight of pixels without data in an interpolated pixel. Chosen by hand."""
 
 MIN_VARIANCE = 1.0
-"""Windows with a lower variance of grey levels are too flat to be compared. Chosen by hand."""
+"""Windows with a variance of grey levels up to this are too flat to compare. Chosen by hand."""
 
 
 def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
-    """Return an image whose longer side has at most `max_side` pixels, and its scale."""
+    """Return an image whose longer side is reduced to at most `max_side` pixels, and its scale."""
     scale = min(1.0, max_side / max(gray.shape))
     if scale == 1:
         return gray, 1.0
-    # Sides are rounded to whole pixels. Sampling by the scale itself keeps it exact for both.
+    # The sides are rounded to whole pixels, but x and y are both sampled at exactly `scale`.
     size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
     smooth = antialiased(gray, scale)
     affine = scaling_matrix(scale)[:2]
@@ -48,11 +48,11 @@ def antialiased(image: np.ndarray, scale: float) -> np.ndarray:
 def warp_to_reference(
     image1: np.ndarray, homography: np.ndarray, size: tuple[int, int], *, exact: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Warp the second image into the frame of the first, by the homography from the first to it.
+    """Warp the second image into the frame of the first; `homography` maps the first to the second.
 
-    Returns the (H, W) or (H, W, 3) image, uint8 or uint16, and the (H, W) bool mask of its valid
-    pixels. OpenCV's cubic kernel keeps detail but shifts it by up to 0.05 px; if positions must be
-    `exact`, the interpolation is linear.
+    Returns the warped image of the given (width, height), and the (H, W) bool mask of the pixels
+    that show the second image. OpenCV's cubic interpolation keeps detail, but shifts it by up to
+    0.05 px. If `exact`, the interpolation is linear, which does not shift.
     """
     flags = (cv2.INTER_LINEAR if exact else cv2.INTER_CUBIC) | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image1, homography, size, flags=flags)
@@ -67,9 +67,10 @@ def warp_bands(
     size: tuple[int, int],
     no_data: float | None = None,
 ) -> np.ndarray:
-    """Warp (H, W, C) of any type as `warp_to_reference` does; pixels without data are `no_data`.
+    """Warp an image of C bands, (H, W, C) of any type of number, as `warp_to_reference` does.
 
-    Result pixels that depend on a `no_data` pixel also become `no_data`. None fills with 0.
+    A pixel has no data if any of its bands has the value `no_data`. Pixels of the result that
+    depend on such a pixel, or lie outside the image, become `no_data`, or 0 if it is None.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:
@@ -98,8 +99,9 @@ def local_zncc(
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation (ZNCC) of windows at the same positions.
 
-    One window is centred on each square of `step_px` pixels; its side is an odd multiple of that.
-    Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for flat or partly masked windows.
+    The images are divided into squares of `step_px` pixels, and one window is centred on each. Its
+    side `window_px` must be an odd multiple of `step_px`. Returns an array (H // step_px,
+    W // step_px) float32 in [-1, 1], NaN for windows that are flat or partly outside `valid_mask`.
     """
     side = window_px // step_px
     shape = (first.shape[0] // step_px, first.shape[1] // step_px)
@@ -131,33 +133,34 @@ def local_zncc(
 
 
 def warped_zncc(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Return the `local_zncc` of the first image and the second one warped to it."""
+    """Warp the second image to the first, and return the `local_zncc` of the two."""
     warped, valid = warp_to_reference(gray1, homography, gray0.shape[::-1])
     first, second = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (gray0, warped))
     return local_zncc(first, second, erode_mask(valid, BLUR_SIGMA_PX))
 
 
 def median_local_zncc(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> float:
-    """Return the median local ZNCC of two images over their overlap, -1 without overlap."""
+    """Return the median `warped_zncc` of two images over their overlap; -1 if there is none."""
     values = warped_zncc(gray0, gray1, homography)
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else -1.0
 
 
 def gaussian_blur(gray: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Blur an image; returns (H, W) float32."""
+    """Blur an (H, W) image with a Gaussian; return float32."""
     return cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
 
 
 def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
-    """Remove the pixels that a blur mixes with pixels outside the mask; (H, W) bool."""
+    """Shrink an (H, W) bool mask by the pixels that a blur mixes with pixels outside the mask."""
     return _erode(mask, 2 * int(np.ceil(3 * blur_sigma_px)) + 1)
 
 
 def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
     """Subtract the mean of the window around each pixel and divide by its standard deviation.
 
-    Returns (H, W) float32. The mean product of two such images over a window is about its ZNCC.
+    Returns (H, W) float32. The ZNCC of two images in a window is approximately the mean of the
+    product of their normalised images over this window.
     """
     window = (WINDOW_PX, WINDOW_PX)
     values = gray.astype(np.float32)
@@ -180,10 +183,10 @@ def window_sums(
     at: np.ndarray | None = None,
     dtype: type[np.floating[Any]] | None = None,
 ) -> np.ndarray:
-    """Sum the values of the pixels in the square window around each pixel, (M,).
+    """Sum the values of sparse pixels over square windows, one sum for each window, (M,).
 
-    The (N, 2) int64 `pixels` (x, y) are all different. `values` has one value for each of them, or
-    one for all. `shape` is the shape of the image, (H, W, ...). The windows are centred at the
+    `pixels` are (N, 2) int64 (x, y), all different. `values` has one value for each of them, or is
+    one value for all. `shape` is that of the image, (H, W, ...). The windows are centred at the
     (M, 2) pixels `at`, by default at `pixels`. The sums have the type of the values, or `dtype`.
     """
     image = _scatter(pixels, values, shape, dtype)
@@ -196,7 +199,7 @@ def window_sums(
 def gaussian_means(
     pixels: np.ndarray, values: np.ndarray, shape: Sequence[int], sigma_px: float, at: np.ndarray
 ) -> np.ndarray:
-    """Average nearby values, weighted by a Gaussian, (M,) float32; otherwise as `window_sums`."""
+    """Average the values around each pixel `at` with Gaussian weights, (M,); see `window_sums`."""
     count, total = (_scatter(pixels, part, shape, np.float32) for part in (1, values))
     count, total = (cv2.GaussianBlur(image, (0, 0), sigma_px) for image in (count, total))
     x, y = at.T
@@ -209,7 +212,7 @@ def _scatter(
     shape: Sequence[int],
     dtype: type[np.floating[Any]] | None,
 ) -> np.ndarray:
-    """Return an image with the values at their pixels, 0 elsewhere."""
+    """Return an (H, W) image with the values at their pixels, and 0 elsewhere."""
     image = np.zeros(tuple(shape[:2]), dtype or np.asarray(values).dtype)
     image[pixels[:, 1], pixels[:, 0]] = values
     return image
@@ -229,11 +232,15 @@ def track_round_trip(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Track (N, 2) points from one (H, W) uint8 image to the other and back (Lucas-Kanade).
 
-    Each of the `levels` of the pyramid above the image doubles how far a track can move. A track
-    that moves by less than `step_px` in an iteration has converged. The search begins at the
-    `expected` (N, 2) positions, by default at the points, and on the way back at the points if
-    `back_to_start`. Returns (N, 2) float32 positions in the second image, and the (N,) distances
-    between both ends of the round trip in pixels, infinite for lost tracks.
+    The image pyramid has `levels` levels besides the image itself; each doubles the distance that
+    a point can move. A track has converged when an iteration moves it by less than `step_px`.
+
+    The search in the second image begins at the (N, 2) positions `expected`, by default at
+    `points`. The search back begins at the position just found, or at `points` if `back_to_start`.
+    If `expected` is given, it begins at the position just found minus the expected motion.
+
+    Returns (N, 2) float32 positions in the second image, and (N,) distances in pixels between the
+    start and the end of each round trip, infinite for lost tracks.
     """
     settings = {
         "winSize": (window_px, window_px),
@@ -258,18 +265,18 @@ def track_round_trip(
 
 
 def equalise(gray: np.ndarray) -> np.ndarray:
-    """Equalise an image locally, so that changes of light are not mistaken for motion."""
+    """Equalise the contrast locally, so that changes of light are not mistaken for motion."""
     return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)
 
 
 WINDOWS_AT_ONCE = 4096
-"""Number of windows that `zncc_at_points` processes at once, which bounds memory."""
+"""`zncc_at_points` processes at most this number of windows at once, which bounds the memory."""
 
 
 def zncc_at_points(
     images: tuple[np.ndarray, np.ndarray], points: tuple[np.ndarray, np.ndarray], side: int
 ) -> np.ndarray:
-    """Return the ZNCC of the windows around (M, 2) points in both images, (M,) float64."""
+    """Return the (M,) ZNCC of blurred windows around (M, 2) matched points; `side` is in pixels."""
     blurred = [gaussian_blur(image, BLUR_SIGMA_PX) for image in images]
     offsets = np.indices((side, side))[::-1].reshape(2, -1) - (side - 1) / 2
     correlations = np.empty(len(points[0]))
@@ -286,14 +293,15 @@ def zncc_at_points(
 
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99
-"""The first is the sigma of the blur before the gradient is computed. Gradients are scaled so that
-the second, a quantile of their lengths, becomes white. Both were chosen by hand."""
+"""EDGE_SIGMA_PX is the sigma of the blur before the gradient is computed. Gradient lengths are
+scaled so that their quantile EDGE_QUANTILE becomes white (255). Both were chosen by hand."""
 
 
 def edge_strength(gray: np.ndarray) -> np.ndarray:
-    """Return the length of the gradient of (H, W) uint8 luma, (H, W) uint8.
+    """Return the length of the gradient of an (H, W) uint8 luma image, scaled to uint8.
 
-    It is the same whichever side of an edge is bright, so images of different sensors look alike.
+    It does not depend on which side of an edge is brighter, so images of different sensors, whose
+    tones may be inverted, look alike.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
     length = np.hypot(cv2.Scharr(smooth, -1, 1, 0), cv2.Scharr(smooth, -1, 0, 1))

@@ -12,39 +12,42 @@ from .._shared.options import suggest_keywords
 UNITS = {
     "m": "metres",
     "mm": "millimetres",
-    "baseline": "baselines (1 = the distance of the two cameras)",
+    "baseline": "baselines (1 = the distance between the two cameras)",
     "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
 }
-"""Units of length, with the names that files give them. The last two have no metric scale."""
+"""Units of length, each with the words that describe it in files. Lengths in one of the last two
+have no metric scale."""
 
 EAST_NORTH_UP = "x east, y north, z up"
-"""Frame of a georeferenced cloud; other frames are those of cameras."""
+"""`PointCloud.frame` of a georeferenced cloud. Any other value is the name of a camera."""
 
 BOX_PERCENTILE = 1.0
-"""Percentage of the points beyond each side of the robust box. Chosen by hand."""
+"""This percentage of the points lies beyond each face of the robust box. Chosen by hand."""
 
 MAX_ANGULAR_SPACING = 0.02
-"""Maximum width of a drawn point as seen by the camera, in radians. Chosen by hand."""
+"""`angular_spacing` returns at most this angle, in radians, which limits the width at which points
+are drawn. Chosen by hand."""
 
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class PointCloud:
-    """Coloured points in the frame of a camera: x right, y down, z forward; or `EAST_NORTH_UP`.
+    """Coloured 3D points in the frame of a camera, or georeferenced (frame `EAST_NORTH_UP`).
 
     Attributes:
-        points: (N, 3) float32 or float64 positions; the camera's centre is (0, 0, 0).
+        points: (N, 3) float32 or float64 positions. In the frame of a camera x is right, y down,
+            and z forward, and the camera's centre is (0, 0, 0).
         colors: (N, 3) uint8 sRGB.
-        unit: "mm", "m", "baseline" (the distance of the two cameras) or "spacing" (the median
+        unit: "mm", "m", "baseline" (the distance between the two cameras) or "spacing" (the median
             distance from one of many cameras to the nearest other).
-        frame: name of the camera, or `EAST_NORTH_UP`.
-        normals: (N, 3) float32 of length 1, towards the cameras, or None.
+        frame: name of the camera whose frame it is, or `EAST_NORTH_UP`.
+        normals: (N, 3) float32 unit vectors, which point towards the cameras, or None.
 
-    `len` and indexing by slices, masks and index arrays work.
+    A cloud has a `len`, and can be indexed by slices, masks and index arrays.
 
     Raises:
-        OptionError: a shape or type is wrong, a coordinate is not finite (or exceeds float32, which
-            files use), or the unit is unknown.
+        OptionError: a shape or type is wrong, a coordinate is not finite or exceeds the range of
+            float32, which files use, or the unit is unknown.
 
     Example:
         >>> cloud = PointCloud([[0.0, 0.0, 900.0], [8.0, 2.0, 950.0]], [[9, 9, 9], [7, 7, 7]], "mm")
@@ -78,9 +81,9 @@ class PointCloud:
             if normals.shape != points.shape:
                 raise OptionError(f"normals must be {points.shape}, not {normals.shape}")
             object.__setattr__(self, "normals", normals)
-        # This form also rejects NaN.
+        # NaN fails this comparison, so it is also rejected.
         if not (np.abs(points) < np.finfo(np.float32).max).all():
-            raise OptionError("every coordinate of a point cloud must be finite: remove the others")
+            raise OptionError("every coordinate of a point must be finite: remove the other points")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "colors", colors)
 
@@ -98,7 +101,7 @@ class PointCloud:
 
     @property
     def axes(self) -> str:
-        """The frame, as files explain it."""
+        """The description of the frame and its axes that is written to files."""
         if self.frame == EAST_NORTH_UP:
             return self.frame
         return f"{self.frame}, x right, y down, z forward, origin at its centre"
@@ -106,26 +109,26 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class RobustBox:
-    """An axis-aligned box around all points except the outermost, given by two (3,) corners."""
+    """An axis-aligned box, from corner `low` to `high`, around all points but the outermost."""
 
     low: np.ndarray
     high: np.ndarray
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) float64, the middle."""
+        """Centre of the box, (3,) float64."""
         return (self.low + self.high) / 2
 
     @property
     def radius(self) -> float:
-        """Half the diagonal; 1 if the box is a point."""
+        """Half the diagonal of the box; 1 if the box is a single point."""
         return float(np.linalg.norm(self.high - self.low)) / 2 or 1.0
 
 
 def robust_box(cloud: PointCloud) -> RobustBox:
     """Find the box from the 1st to the 99th percentile of each coordinate.
 
-    A few distant outliers hardly change it. An empty cloud is an OptionError.
+    A few distant outliers hardly change it. An empty cloud raises an OptionError.
     """
     require_points(cloud)
     low, high = np.percentile(
@@ -137,8 +140,8 @@ def robust_box(cloud: PointCloud) -> RobustBox:
 def angular_spacing(cloud: PointCloud) -> float:
     """Return the angle between neighbouring points as seen by the left camera, in radians.
 
-    It is estimated as if the points were spread evenly. A dense cloud looks like a closed surface
-    if its points are drawn in this width. An empty cloud is an OptionError.
+    It is estimated as if the points were spread evenly over the view. If points are drawn with this
+    angular width, a dense cloud looks like a closed surface. An empty cloud raises an OptionError.
     """
     require_points(cloud)
     ahead = cloud.points[cloud.points[:, 2] > 0]

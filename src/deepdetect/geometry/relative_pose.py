@@ -1,4 +1,4 @@
-"""Relative pose of two calibrated cameras from matches, and triangulation."""
+"""Estimate the relative pose of two calibrated cameras from matches, and triangulate matches."""
 
 from __future__ import annotations
 
@@ -12,36 +12,45 @@ from .estimation import GeometryOptions, estimate_geometry
 from .transforms import epipolar_errors, signed_epipolar_errors
 
 Pose = tuple[np.ndarray, np.ndarray]
-"""A pose is a rotation (3, 3) and a translation (3,): X1 = rotation @ X0 + translation."""
+"""A rotation (3, 3) and a translation (3,). They map a point X0 in the frame of the first camera to
+X1 = rotation @ X0 + translation in the frame of the second."""
 
 BLOCK = 100_000
-"""Number of matches triangulated at once, to bound the memory of some twenty arrays."""
+"""`triangulate` processes at most this number of matches at once, because it needs the memory of
+some twenty arrays of that length."""
 
 MAX_ITERATIONS = 10
 """Gauss-Newton stops after this many steps. Chosen by hand."""
 
 DERIVATIVE_STEP = 1e-6
-"""Numerical derivatives vary the pose by this angle, in radians."""
+"""Numerical derivatives vary each parameter of the pose by this angle, in radians."""
 
 MIN_CHANGE = 1e-9
-"""The refinement ends when the pose changes by less than this angle, in radians."""
+"""The refinement ends when no parameter of the pose changes by more than this, in radians."""
 
 MAX_REFITS = 4
-"""The pose is fitted to its own inliers again at most this many times. Chosen by hand."""
+"""The pose that RANSAC finds is fitted to its inliers, which are then determined again. This is
+done at most this many times. Chosen by hand."""
 
 MIN_INLIER_GAIN = 0.01
-"""A fit is repeated while the number of inliers grows by this fraction. Chosen by hand."""
+"""The pose is fitted again only if the previous fit raised the number of inliers by more than this
+fraction. Chosen by hand."""
 
 MAX_MATCHES = 50_000
-"""The pose is fitted to at most this many evenly sampled matches: more do not improve it."""
+"""If there are more matches than this, the pose is fitted to every k-th of them, because more do
+not improve it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Points (N, 3) float64 in the frame of the first camera, not finite where rays are parallel.
+    """Points triangulated from N matches.
 
-    `cheirality` (N,) bool tells the points in front of both cameras. The (N,) reprojection errors
-    in pixels are the root mean square of both images. The (N,) angles of the rays are in radians.
+    Attributes:
+        points: (N, 3) float64 in the frame of the first camera; not finite where the two rays are
+            parallel.
+        cheirality: (N,) bool, True for points in front of both cameras.
+        reprojection_errors: (N,) root mean square, in pixels, of the errors in the two images.
+        triangulation_angle: (N,) angles between the two rays, in radians.
     """
 
     points: np.ndarray
@@ -57,11 +66,12 @@ def triangulate(
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> Triangulation:
-    """Triangulate (N, 2) matches in pixels by the pose X1 = rotation @ X0 + translation.
+    """Triangulate (N, 2) matches in pixels; the pose is X1 = rotation @ X0 + translation.
 
-    The positions are first moved onto corresponding epipolar lines (`correct_matches`), which is
-    the maximum likelihood estimate for equal noise in both images. The two rays then meet, and the
-    depth follows from one division, which is accurate even at small angles.
+    The positions of each match are first moved onto corresponding epipolar lines by
+    `correct_matches`, which is the maximum likelihood estimate if the noise in both images is
+    equal. The two rays then meet, and the depth follows from one division, which is accurate even
+    if the angle between the rays is small.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -77,7 +87,7 @@ def triangulate(
     rays0 = camera0.rays(moved0)
     rays1 = camera1.rays(moved1)
     rotated = rays0 @ rotation.T
-    # ray1 x (depth * rotated + translation) = 0
+    # Solve ray1 x (depth * rotated + translation) = 0 for the depth.
     normals = np.cross(rays1, rotated)
     squares = np.einsum("ij,ij->i", normals, normals)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -95,7 +105,7 @@ def correct_matches(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move (N, 2) matches as little as possible so that x1^T F x0 = 0 holds.
 
-    Lindstrom, "Triangulation made easy", 2010, algorithm niter2.
+    This is the algorithm niter2 of Lindstrom, "Triangulation made easy", 2010.
     """
     first = np.column_stack([points0, np.ones(len(points0))])
     second = np.column_stack([points1, np.ones(len(points1))])
@@ -113,20 +123,24 @@ def correct_matches(
         step = step * 2 * root / ((next0**2).sum(1) + (next1**2).sum(1))
         moved0 = points0 - step[:, None] * next0
         moved1 = points1 - step[:, None] * next1
-    # Every line through an epipole is an epipolar line, so a match on it stays where it is.
+    # The correction of a match at an epipole is not finite. This match needs none, because every
+    # line through an epipole is an epipolar line.
     known = np.isfinite(moved0).all(1) & np.isfinite(moved1).all(1)
     return np.where(known[:, None], moved0, points0), np.where(known[:, None], moved1, points1)
 
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """The pose of the second camera: X1 = rotation @ X0 + translation.
+    """The pose of the second camera in the frame of the first, estimated from M matches.
+
+    A point X0 in the frame of the first camera is X1 = rotation @ X0 + translation in the frame of
+    the second.
 
     Attributes:
         rotation: (3, 3) float64.
-        translation: (3,) float64 of length 1: only its direction can be known.
-        inliers: (M,) bool, the matches with an error below the threshold.
-        errors: (M,) float64 Sampson distances in pixels.
+        translation: (3,) float64 of length 1, because only its direction can be known.
+        inliers: (M,) bool, True for matches with an error below the threshold.
+        errors: (M,) float64 Sampson distances of all matches in pixels.
         cheirality_ratio: fraction of the inliers that lie in front of both cameras, in [0, 1].
     """
 
@@ -143,7 +157,7 @@ class RelativePose:
 
 
 def rotation_angle(rotation: np.ndarray) -> float:
-    """Return the angle of a rotation in degrees, accurate even for small angles."""
+    """Return the angle of a rotation in degrees; small angles are accurate as well."""
     skew = (rotation - rotation.T)[[2, 0, 1], [1, 2, 0]]
     return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(rotation) - 1)))
 
@@ -157,7 +171,8 @@ def estimate_relative_pose(
 ) -> RelativePose | None:
     """Estimate the relative pose from (M, 2) matches in pixels, by MAGSAC and a refinement.
 
-    Returns None if there are too few matches or the estimation fails.
+    The threshold is a Sampson distance in pixels. Returns None if there are too few matches or the
+    estimation fails.
     """
     essential = GeometryOptions(
         inlier_threshold=inlier_threshold,
@@ -200,9 +215,9 @@ def refine_pose(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine a pose by the Sampson distances of (M, 2) matches, most of them correct.
 
-    Gauss-Newton minimises a Cauchy loss over three angles of the rotation and two of the direction
-    of the translation. The result is never worse than the initial pose. A match with half of
-    `scale_px` as its distance has half the weight of an exact one.
+    Gauss-Newton minimises a Cauchy loss over five angles: three of the rotation and two of the
+    direction of the translation. The loss of the result is never higher than that of the initial
+    pose. A match with a Sampson distance of `scale_px` / 2 has half the weight of an exact match.
     """
     points0, points1 = _evenly(points0), _evenly(points1)
 
@@ -234,9 +249,10 @@ def refine_pose(
 
 
 def moved_pose(pose: Pose, change: np.ndarray) -> Pose:
-    """Return a pose near another: a change of 5 angles in radians.
+    """Return a pose that differs from the given one by five small angles in radians.
 
-    The first three change the rotation, the other two the translation, which keeps the length 1.
+    The first three angles change the rotation. The other two change the direction of the
+    translation, whose length stays 1.
     """
     rotation, translation = pose
     small = cv2.Rodrigues(np.asarray(change[:3], np.float64))[0]
@@ -248,7 +264,7 @@ def moved_pose(pose: Pose, change: np.ndarray) -> Pose:
 
 
 def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the cross product of two vectors, in a tenth of the time of `np.cross`."""
+    """Return the cross product of two (3,) vectors, in a tenth of the time of `np.cross`."""
     (x0, y0, z0), (x1, y1, z1) = first.tolist(), second.tolist()
     return np.array([y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1])
 
@@ -256,9 +272,10 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def best_of_four(
     essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose, of the four of an essential matrix, with most points before both cameras.
+    """Return the one of the four poses of an essential matrix that the matches support most.
 
-    The essential matrix is in normalised coordinates, the (M, 2) matches are in pixels.
+    For this pose, most triangulated points lie in front of both cameras. The essential matrix is in
+    normalised coordinates, and the (M, 2) matches are in pixels.
     """
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
     points0, points1 = _evenly(points0), _evenly(points1)

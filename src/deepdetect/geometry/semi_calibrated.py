@@ -1,11 +1,12 @@
-"""The fundamental matrix of two usual cameras with an unknown focal length.
+"""Estimate the fundamental matrix of two ordinary cameras whose focal length is not known.
 
-The assumptions hold for most images: pixels are square, the principal point lies near the middle of
-the image, and both images were taken with about the same focal length. A few focal lengths are
-tried. For each of them RANSAC needs only five matches per sample, for a relative pose, instead of
-seven for a fundamental matrix. So more samples are free of wrong matches, and the model has fewer
-degrees of freedom to fit wrong ones. The focal length with most inliers is kept. Then the pose and
-both cameras are fitted to the inliers together.
+Three assumptions hold for most pairs of images: pixels are square, the principal point lies near
+the middle of the image, and both images were taken with about the same focal length. RANSAC is run
+for each of a few focal lengths. If a focal length is given, a sample for a relative pose needs only
+five matches, while a sample for a fundamental matrix needs seven. Therefore more samples contain no
+wrong match, and the model has fewer degrees of freedom that could fit wrong matches. The focal
+length whose inliers are the best evidence is kept. Then the pose and the parameters of both cameras
+are fitted to these inliers together.
 """
 
 from __future__ import annotations
@@ -23,40 +24,43 @@ from .relative_pose import Pose, best_of_four, moved_pose
 from .transforms import epipolar_errors, signed_epipolar_errors
 
 MODELS_PER_SAMPLE = 10
-"""Five matches give up to ten essential matrices."""
+"""The solver finds up to ten essential matrices for each sample of five matches."""
 
 START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
-"""Initial focal lengths of a fit, in units of the longer side of the image. The fit starts from the
-one that turns the fundamental matrix most nearly into an essential matrix. Chosen by hand."""
+"""Candidates for the initial focal length of a fit, in units of the longer side of the image. A fit
+starts from the one that makes the fundamental matrix most nearly essential. Chosen by hand."""
 
 MIN_MATCHES = 6
-"""An essential matrix needs five matches; one more is needed to judge it."""
+"""An essential matrix needs five matches, and a sixth one to test it."""
 
 FOCAL_LENGTHS = (0.7, 1.4)
-"""Focal lengths that are tried, in units of the longer side of the image. These two are as good as
-a dense range that covers fields of view from 90 to 28 degrees."""
+"""RANSAC is run with each of these focal lengths, in units of the longer side of the image. These
+two give results as good as a dense range that covers fields of view from 90 to 28 degrees."""
 
 CONFIDENCE = 0.9999
-"""RANSAC stops when some sample was free of outliers with this probability."""
+"""RANSAC stops when at least one sample was free of outliers with this probability."""
 
 ITERATIONS = 5000
 """RANSAC draws at most this many samples for each focal length. Chosen by hand."""
 
 FOCAL_SPREAD = 0.7
-"""Prior standard deviation of ln(focal length / longer side). Chosen by hand."""
+"""The prior is that ln(focal length / longer side of the image), averaged over the two cameras, has
+the mean 0 and this standard deviation. Chosen by hand."""
 
 FOCAL_DIFFERENCE = 0.03
-"""Prior standard deviation of ln(focal length 0 / focal length 1). Chosen by hand."""
+"""The prior is that ln(focal length 0 / focal length 1), each in units of the longer side of its
+image, has the mean 0 and this standard deviation. Chosen by hand."""
 
 PRINCIPAL_POINT_SPREAD = 0.03
-"""Prior standard deviation of the principal point from the image centre, in longer sides. Chosen
-by hand."""
+"""The prior is that the principal point deviates from the image centre, in x and in y, with this
+standard deviation, in units of the longer side of the image. Chosen by hand."""
 
 MATCH_SIGMA_PX = 0.5
-"""Standard deviation of correct matches from epipolar lines, in pixels. Chosen by hand."""
+"""Standard deviation of correct matches from their epipolar lines. Chosen by hand."""
 
 MAX_FITS = 4
-"""Pose and cameras are fitted to their own inliers at most this many times. Chosen by hand."""
+"""Pose and cameras are fitted at most this many times, each time to the inliers of the previous
+fit. Chosen by hand."""
 
 MAX_ITERATIONS = 20
 """Levenberg-Marquardt stops after this many steps. Chosen by hand."""
@@ -71,8 +75,9 @@ def estimate_semi_calibrated(
 ) -> TwoViewModel | None:
     """Estimate a fundamental matrix from (M, 2) matches, many of which may be wrong.
 
-    The sizes of the images are (width, height), and the threshold is a Sampson distance in pixels.
-    Returns None if there are too few matches or the estimation fails.
+    See the module for the method and its assumptions. `sizes` are the (width, height) of the two
+    images, and the threshold is a Sampson distance in pixels. Returns None if there are too few
+    matches or the estimation fails.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -85,7 +90,7 @@ def estimate_semi_calibrated(
         alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
         return TwoViewModel("fundamental", fundamental, inliers, alarms)
 
-    # OpenCV draws the same samples every time; another order of the matches draws others.
+    # OpenCV always draws the same samples; shuffled matches make them depend on the seed.
     order = np.random.default_rng(seed).permutation(len(points0))
     best = start = None
     for focal in FOCAL_LENGTHS:
@@ -111,7 +116,7 @@ def estimate_semi_calibrated(
             break
         hopeless = best.log10_nfa == model.log10_nfa > 0
         best = model
-        if hopeless:  # further fits sharpen what nobody will trust
+        if hopeless:  # chance explains the inliers, and their number does not grow
             break
     return best
 
@@ -123,11 +128,12 @@ def refine_fundamental(
     sizes: tuple[Size, Size],
     match_sigmas_px: np.ndarray,
 ) -> np.ndarray:
-    """Refine a fundamental matrix by matches, most of them correct, and by a prior on the cameras.
+    """Refine a fundamental matrix by matches, most of them correct, and a prior on the cameras.
 
-    The prior decides where the matches say little, such as on the focal length or at the borders.
-    `match_sigmas_px` are the (M,) standard deviations of the matches from their epipolar lines. The
-    result has norm 1. With fewer than six matches the given matrix is returned.
+    The prior decides what the matches hardly determine, such as the focal length, or the epipolar
+    lines near the image borders. `match_sigmas_px` are the (M,) expected standard deviations of the
+    distances of matches from their epipolar lines. The result has norm 1. With fewer than six
+    matches the given matrix is returned unchanged.
     """
     if len(points0) < MIN_MATCHES:
         return fundamental
@@ -139,7 +145,7 @@ def refine_fundamental(
 
 
 def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Cameras:
-    """Return the cameras, of `START_FOCAL_LENGTHS`, that make the matrix most nearly essential."""
+    """Return the cameras whose focal length makes the matrix most nearly an essential matrix."""
 
     def likeness(cameras: _Cameras) -> float:
         largest, middle, _ = np.linalg.svd(cameras.essential(fundamental), compute_uv=False)
@@ -150,9 +156,11 @@ def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Came
 
 @dataclass(frozen=True, eq=False)
 class _Cameras:
-    """Both cameras: (2,) natural logarithms of focal lengths, (2, 2) offsets of principal points.
+    """The two cameras, as six parameters.
 
-    Focal lengths and offsets are in units of the longer side of each image.
+    `log_focal` has the (2,) natural logarithms of their focal lengths. `offsets` has one row (x, y)
+    for each camera: its principal point minus the image centre. Focal lengths and offsets are in
+    units of the longer side of each image.
     """
 
     sizes: tuple[Size, Size]
@@ -186,21 +194,21 @@ class _Cameras:
         return calibration.camera1.matrix.T @ fundamental @ calibration.camera0.matrix
 
     def moved(self, change: np.ndarray) -> _Cameras:
-        """Return cameras near these: a change of 6 parameters."""
-        if not change.any():  # with their inverses
+        """Return these cameras with a (6,) change added to their parameters."""
+        if not change.any():  # keeps the cached inverses
             return self
         offsets = self.offsets + change[2:].reshape(2, 2)
         return _Cameras(self.sizes, self.log_focal + change[:2], offsets)
 
     def deviations(self) -> np.ndarray:
-        """Return the (6,) deviations of the parameters from the prior, in standard deviations."""
+        """Return the (6,) deviations from the prior, each in units of its standard deviation."""
         mean, difference = self.log_focal.mean(), self.log_focal[0] - self.log_focal[1]
         of_focal = [mean / FOCAL_SPREAD, difference / FOCAL_DIFFERENCE]
         return np.append(of_focal, self.offsets / PRINCIPAL_POINT_SPREAD)
 
 
 Views = tuple[Pose, _Cameras]
-"""A relative pose and both cameras: 11 parameters."""
+"""A relative pose and the two cameras: 5 + 6 parameters."""
 
 
 def _fundamental(pose: Pose, cameras: _Cameras) -> np.ndarray:
@@ -235,7 +243,7 @@ def _fit_essential(
 
 
 def _fit(views: Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> Views:
-    """Fit pose and cameras to matches with a Cauchy loss and the prior (a MAP estimate)."""
+    """Fit pose and cameras to matches with a Cauchy loss, and to the prior (a MAP estimate)."""
     count = len(points0)
 
     def residuals(views: Views) -> np.ndarray:

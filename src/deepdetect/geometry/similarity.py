@@ -1,7 +1,7 @@
-"""Robust fitting of a similarity between points in two frames, which georeferences a model.
+"""Fit a similarity robustly to points that are known in two frames, to georeference a model.
 
-Least median of squares finds a similarity on which most points agree. Gauss-Newton with Huber's
-weights then refines it by all points, and by directions that are known to be horizontal.
+A least-median-of-squares search finds a similarity on which most points agree. Gauss-Newton with
+Huber's weights then refines it, using all points and directions that are known to be horizontal.
 """
 
 from __future__ import annotations
@@ -15,41 +15,46 @@ from .._shared.opencv import cv2
 from .camera import cross_matrix
 
 MIN_POINTS = 3
-"""Minimum number of points that must agree: they determine a similarity."""
+"""The fit fails if fewer points than this agree, because a similarity needs three points."""
 
 MAX_SAMPLES = 500
-"""Number of pairs, and of triples, of points that the search tries. Chosen by hand."""
+"""The search tries this number of random triples of points and, if the upward direction is known,
+the same number of pairs. Chosen by hand."""
 
 MAX_START_TILT_DEG = 60.0
-"""The similarity of three points may tilt the known upward direction by at most this angle. Three
-points near a line may give any tilt."""
+"""A similarity fitted to three points may tilt the known upward direction away from the z axis by
+at most this angle, because three points that lie nearly on a line can give any tilt."""
 
 MIN_AREA_POINTS, MIN_AREA = 8, 0.2
-"""The points can overrule the known upward direction only if there are at least as many as the
-first, and their second principal spread exceeds the first one times the second. Chosen by hand."""
+"""The points can overrule the known upward direction only if they determine a rotation well: there
+must be at least MIN_AREA_POINTS points, and their spread along the second principal axis, divided
+by that along the first, must be above MIN_AREA. Chosen by hand."""
 
 MUCH_BETTER = 0.5
-"""The known upward direction is overruled if the median distance without it is below this fraction
-of the median distance with it. Chosen by hand."""
+"""The known upward direction is overruled if the best similarity that tilts it by more than
+`MAX_START_TILT_DEG` has a median distance between targets and transformed points below this
+fraction of that of the best similarity that tilts it less. Chosen by hand."""
 
 HUBER_STDS = 2.0
-"""Residuals above this many standard deviations get less weight. Chosen by hand."""
+"""Residuals larger than this number of standard deviations get less weight. Chosen by hand."""
 
 WRONG_STDS = 5.0
 """A point with a residual above this many standard deviations gets no weight. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
-"""The stated accuracy counts as this many residuals: few residuals say little. Chosen by hand."""
+"""The stated accuracy of the targets counts as much as this number of residuals, because a few
+residuals say little about the true accuracy. Chosen by hand."""
 
 MAD_STD = 1.4826
-"""Standard deviation of a normal distribution, divided by the median of absolute values."""
+"""Ratio of the standard deviation of normally distributed values to the median of their absolute
+values."""
 
 MAX_ITERATIONS, MIN_STEP = 50, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """y = scale * rotation @ x + translation."""
+    """A similarity of 3D points: y = scale * rotation @ x + translation."""
 
     scale: float
     rotation: np.ndarray
@@ -65,13 +70,15 @@ class SimilarityFit:
     """A similarity, and how reliable it is.
 
     Attributes:
-        similarity: from the points to the targets.
-        residuals: (N, 3) target minus transformed point.
-        wrong: (N,) bool, points that do not agree with the others.
-        scale_std: relative standard deviation of the scale; 0 if it was given.
-        axes_std_deg: (3,) standard deviations of the rotation about the x, y and z axis.
-        axis_std_deg_of_targets: that about the least certain axis, from the targets alone; 180 if
-            they do not determine it.
+        similarity: similarity that maps the points to the targets.
+        residuals: (N, 3) targets minus transformed points, NaN where the target is unknown.
+        wrong: (N,) bool, True for points that do not agree with the others.
+        scale_std: relative standard deviation of the scale; 0 if the scale was given.
+        axes_std_deg: (3,) standard deviations, in degrees, of the rotation about the x, y and z
+            axes of the targets.
+        axis_std_deg_of_targets: standard deviation, in degrees, of the rotation about its least
+            certain axis if only the points and targets are used, without horizontal directions; 180
+            if they do not determine this rotation.
     """
 
     similarity: Similarity
@@ -93,17 +100,17 @@ def fit_similarity(
     scale: float | None = None,
     seed: int = 0,
 ) -> SimilarityFit:
-    """Fit the similarity on which most of the points agree.
+    """Fit the similarity from points to targets on which most of the points agree.
 
     Args:
-        points: (N, 3), three or more.
-        targets: (N, 3) target positions, z up; z may be NaN where it is unknown.
-        accuracy: standard deviation of the targets, as far as it is known beforehand.
+        points: (N, 3) positions of at least three points.
+        targets: (N, 3) target positions of these points, z up; z may be NaN where it is unknown.
+        accuracy: expected standard deviation of the targets.
         up: (3,) approximate upward direction in the frame of the points.
-        level, level_stds: (L, 3) directions in this frame that are horizontal, and (L,) their
+        level, level_stds: (L, 3) horizontal directions in the frame of the points, and their (L,)
             standard deviations in radians.
         scale: the scale, if it is known.
-        seed: seed of the random choices.
+        seed: seed of the random samples.
 
     Raises:
         ReconstructionError: the points coincide, or too few of them agree.
@@ -137,7 +144,8 @@ def fit_similarity(
         weighted = jacobian * weights[:, None, None]
         of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
         right = np.einsum("nai,na->i", weighted, residuals / stds)
-        # e_z . exp(w) R v = 0, robust like the points: some photographs are tilted.
+        # A level direction v is horizontal if e_z . exp(w) R v = 0. Deviating directions get less
+        # weight, as points do, because some photographs are tilted.
         seen = level @ current.rotation.T
         errors = seen[:, 2] / level_stds
         rows = np.zeros((len(level), 7))
@@ -176,7 +184,7 @@ def _search(
     scale: float | None,
     seed: int,
 ) -> Similarity | None:
-    """Find the similarity of three points, or two and `up`, with the least median distance."""
+    """Find the similarity of 3 random points, or of 2 and `up`, with the least median distance."""
     random = np.random.default_rng(seed)
     best: dict[bool, tuple[float, Similarity | None]] = dict.fromkeys((True, False), (np.inf, None))
     for size in [3] * MAX_SAMPLES + [2] * (0 if up is None else MAX_SAMPLES):
@@ -204,12 +212,13 @@ def least_squares_similarity(
 ) -> Similarity | None:
     """Fit a similarity by least squares (Umeyama, 1991). None if all points coincide.
 
-    With `up`, this direction is mapped to the z axis, and only the rotation about it is fitted.
+    If `up` is given, this direction is mapped to the z axis, and only the rotation about the z axis
+    is fitted.
     """
     middle, middle_of_targets = points.mean(axis=0), targets.mean(axis=0)
     own, other = points - middle, targets - middle_of_targets
     if up is not None:
-        across = np.linalg.svd(np.asarray(up)[None])[2][1:]  # any two axes
+        across = np.linalg.svd(np.asarray(up)[None])[2][1:]  # any two axes across `up`
         upright = np.array([across[0], np.cross(up, across[0]), up])
         own = own @ upright.T
         own[:, 2] = other[:, 2] = 0
@@ -228,7 +237,7 @@ def least_squares_similarity(
 
 
 def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.ndarray:
-    """Return the (3,) standard deviations of the targets, the same for x and y."""
+    """Return the (3,) standard deviations of the targets; those of x and y are the same."""
     stds = []
     for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: number of fitted parameters
         values = np.abs(residuals[:, axes][known[:, axes]])
@@ -239,6 +248,6 @@ def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.nda
 
 
 def _covariance(normal: np.ndarray) -> np.ndarray:
-    """Invert a normal matrix, with large variances for parameters that it does not determine."""
+    """Invert a normal matrix; parameters that it does not determine get large variances."""
     values, vectors = np.linalg.eigh(normal)
     return np.asarray(vectors / np.maximum(values, 1e-12 * values[-1]) @ vectors.T)

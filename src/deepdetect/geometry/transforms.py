@@ -1,4 +1,4 @@
-"""Homographies and fundamental matrices applied to points, and their errors in pixels."""
+"""Apply homographies and fundamental matrices to points, and measure errors of matches."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Map points by a homography.
 
     Args:
-        points: (N, 2) positions, centre of the first pixel (0, 0).
-        homography: (3, 3), acting on columns (x, y, 1).
+        points: (N, 2) positions; the centre of the first pixel is (0, 0).
+        homography: (3, 3) matrix that multiplies columns (x, y, 1).
 
     Returns:
-        (N, 2) float64; infinite for points that are mapped to infinity.
+        (N, 2) float64 positions; infinite for points that are mapped to infinity.
 
     Example:
         >>> transform_points([[1, 2]], np.diag([2, 2, 1])).tolist()
@@ -32,7 +32,8 @@ def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
 def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Return the transfer error of each match under a homography, (N,) float64 in pixels.
 
-    The error is one-way: the distance in the second image, as in the paper.
+    The error is one-way, as in the DeepDetect paper: the distance, in the second image, between the
+    mapped first position and the matched position.
     """
     gaps = transform_points(points0, homography)
     gaps -= points1
@@ -42,14 +43,14 @@ def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.nda
 def epipolar_errors(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> np.ndarray:
-    """Return the Sampson distance of each match from a fundamental matrix, in pixels.
+    """Return the Sampson distance of each match under a fundamental matrix, in pixels.
 
     Args:
         points0, points1: (N, 2) matched positions.
-        fundamental: (3, 3) with x1^T F x0 = 0.
+        fundamental: (3, 3) matrix F for which correct matches fulfil x1^T F x0 = 0.
 
     Returns:
-        (N,) float64.
+        (N,) float64 distances.
     """
     return np.abs(signed_epipolar_errors(points0, points1, fundamental))
 
@@ -57,7 +58,7 @@ def epipolar_errors(
 def signed_epipolar_errors(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> np.ndarray:
-    """Return `epipolar_errors` with a sign that tells the side of the epipolar line."""
+    """Return `epipolar_errors` with a sign: the side of the epipolar line on which a match lies."""
     points0, points1 = np.asarray(points0, np.float64), np.asarray(points1, np.float64)
     across1, down1, algebraic = _apply(fundamental, points0)
     across0, down0 = _apply(fundamental.T[:2], points1)
@@ -72,9 +73,10 @@ def signed_epipolar_errors(
 
 
 def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Return the coordinates of the points (x, y, 1) times a matrix of three columns.
+    """Multiply (N, 2) points, as columns (x, y, 1), by a matrix of three columns.
 
-    Each coordinate is computed by itself, because a matrix product takes several times as long.
+    Returns a list with one (N,) array for each row of the matrix. Each is computed by itself,
+    because a matrix product takes several times as long.
     """
     x, y = points[:, 0], points[:, 1]
     coordinates = []
@@ -87,17 +89,18 @@ def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
 
 
 TOLERANCE_PX = 1.0
-"""A match is correct within this distance of the ground truth, as in Middlebury's evaluation."""
+"""A match is correct if its distance from the ground truth is at most this, as in Middlebury's
+evaluation."""
 
 
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-    """Return the distances of a rectified pair's matches from the true disparity.
+    """Return how far the matches of a rectified pair lie from their true positions.
 
     Args:
-        points0: (N, 2) positions in the left image; the nearest pixel is read.
+        points0: (N, 2) positions in the left image; the disparity is read at the nearest pixel.
         points1: (N, 2) matched positions in the right image.
-        disparity: (H, W) ground-truth disparity of the left image in pixels: the true match of
-            (x, y) is (x - d, y). Not finite where it is unknown.
+        disparity: (H, W) ground-truth disparity d of the left image in pixels: the true match of
+            (x, y) is (x - d, y). It is not finite where it is unknown.
 
     Returns:
         (N,) float64 distances in pixels, NaN where the true disparity is unknown.
@@ -110,7 +113,7 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
 
 
 def score_errors(errors: np.ndarray) -> dict[str, float]:
-    """Score the (N,) errors of `disparity_errors`, NaN where the ground truth is unknown.
+    """Score the (N,) errors from `disparity_errors`, which are NaN without ground truth.
 
     Returns the number of all "matches", of "evaluated" matches (with known ground truth), and of
     "correct" matches (within `TOLERANCE_PX`), and the "precision": correct / evaluated.
@@ -128,28 +131,28 @@ def translation_matrix(x: float, y: float) -> np.ndarray:
 
 
 def outer_corners(size: tuple[int, int]) -> np.ndarray:
-    """Return the corners of an image, half a pixel beyond the outermost centres; (4, 2)."""
+    """Return the (4, 2) outer corners of an image, half a pixel beyond the outermost centres."""
     width, height = size
     return np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
 
 
 def scaling_matrix(scale: float) -> np.ndarray:
-    """Return the (3, 3) homography from an image to the same image at another scale."""
+    """Return the (3, 3) homography from an image to a copy of it that is `scale` times as large."""
     shift = 0.5 * scale - 0.5
     return np.array([[scale, 0, shift], [0, scale, shift], [0, 0, 1]])
 
 
 def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
-    """Return positions of an image at another scale; pixel centres are whole numbers in both."""
+    """Map positions to a copy of the image at `scale`; pixel centres are whole numbers in both."""
     return (np.asarray(points, np.float64) + 0.5) * scale - 0.5
 
 
 def scaled_homography(homography: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
-    """Return the homography for scaled copies of both images; its last element is 1."""
+    """Return the homography between scaled copies of two images; its last element is 1."""
     matrix = scaling_matrix(scale1) @ homography @ scaling_matrix(1 / scale0)
     return matrix / matrix[2, 2]
 
 
 def scaled_fundamental(fundamental: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
-    """Return the fundamental matrix for scaled copies of both images."""
+    """Return the fundamental matrix of copies of both images, scaled by `scale0` and `scale1`."""
     return scaling_matrix(1 / scale1).T @ fundamental @ scaling_matrix(1 / scale0)

@@ -1,8 +1,9 @@
-"""What two images show: a plane, a rotation, depth, the same view, or nothing in common.
+"""Decide what two images show: a plane, a rotation, depth, the same view, or nothing in common.
 
-Matching, reconstruction and stitching all use this decision. It rests on a homography and a
-fundamental matrix of the same matches, and on the parallax that the homography leaves. The
-thresholds were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip.
+Matching, reconstruction and stitching all use this decision. A homography and a fundamental matrix
+are fitted to the same matches. The decision depends on their inliers, and on the parallax of the
+matches that the homography does not explain. The thresholds were chosen on Oxford, Middlebury,
+Strecha's fountain and a KITTI clip.
 """
 
 from __future__ import annotations
@@ -25,35 +26,38 @@ from .semi_calibrated import START_FOCAL_LENGTHS, estimate_semi_calibrated
 from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
-"""Inlier thresholds in pixels of models that only guide: keypoints of small copies are coarse."""
+"""Inlier thresholds in pixels of the models that guide matching. They are fitted to keypoints of
+reduced copies of the images, which are less accurate."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
-"""Inlier thresholds in pixels for classifying a scene. Chosen on the data named above."""
+"""Inlier thresholds in pixels of the models by which a scene is classified. Chosen on Oxford,
+Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_MATCHES = 30
-"""A scene is not classified with fewer matches. Chosen on the data named above."""
+"""A scene with fewer matches than this is not classified. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MIN_PLANAR_RATIO = 0.75
-"""A scene is a plane only if the homography has at least this fraction of the fundamental matrix's
-number of inliers. Chosen on the data named above."""
+"""A scene is a plane only if the homography has at least this fraction of the number of inliers of
+the fundamental matrix. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MAX_MEDIAN_MOTION_PX = 0.5
-"""Two images show the same view only if the median match moves less than this."""
+"""Two images show the same view only if the median distance that the matches move is below this."""
 
 MAX_MOTION_PX, MOTION_QUANTILE = 3.0, 0.9
-"""Two images show the same view only if the motion of the matches, in pixels, is below the first at
-the quantile given by the second. Chosen on the data named above."""
+"""Two images show the same view only if the MOTION_QUANTILE of the distances that matches move is
+below MAX_MOTION_PX. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 FOREGROUND_DISTANCE_PX = 6.0
-"""A match with a larger transfer error than this, in pixels, is clearly off the plane."""
+"""A match is clearly off the plane if its transfer error under the homography is above this."""
 
 MIN_FOREGROUND_FRACTION = 0.05
-"""There is a foreground only if this fraction of the fundamental matrix's inliers is clearly off
-the plane. Chosen on the data named above."""
+"""There is a foreground only if at least this fraction of the inliers of the fundamental matrix is
+clearly off the plane. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MIN_FOREGROUND_ON_LINES = 0.8
-"""There is a foreground only if this fraction of the matches clearly off the plane are inliers of
-the fundamental matrix. On sixteen planar pairs of Oxford, without foreground, it is up to 0.65."""
+"""There is a foreground only if at least this fraction of the matches clearly off the plane are
+inliers of the fundamental matrix. On sixteen planar pairs of Oxford, which have no foreground, the
+fraction is at most 0.65."""
 
 
 def fit_model(
@@ -64,7 +68,7 @@ def fit_model(
     threshold_px: float,
     seed: int = 0,
 ) -> TwoViewModel:
-    """Fit a homography or a fundamental matrix to (M, 2) matches, and measure its evidence."""
+    """Fit a model to (M, 2) matches, and compute the logarithm of its number of false alarms."""
     options = GeometryOptions(inlier_threshold=threshold_px)
     geometry = estimate_geometry(points0, points1, model, seed=seed, options=options)
     if geometry.matrix is None:
@@ -83,9 +87,11 @@ def choose_model(
 ) -> TwoViewModel:
     """Return the model that may guide matching; many of the matches may be wrong.
 
-    The caller decides whether to trust the model. "auto" is the homography, or the fundamental
-    matrix if the matches alone show depth. With `semi_calibrated`, the fundamental matrix may come
-    from `estimate_semi_calibrated`, which needs fewer matches but more time.
+    `model` is "homography", "fundamental" or "auto". "auto" takes a trusted homography, unless
+    the matches that it does not explain show depth. Otherwise it takes the fundamental matrix if
+    that is trusted or has fewer false alarms. With `semi_calibrated`, the fundamental matrix may
+    come from `estimate_semi_calibrated`, which needs fewer correct matches but more time. The
+    caller must check whether the result is `trusted`.
     """
     plane = TwoViewModel("none", None, np.zeros(len(points0), bool), float("inf"))
     if model != "fundamental":
@@ -116,9 +122,9 @@ def classify_scene(
 ) -> tuple[str, TwoViewModel]:
     """Classify a pair by (M, 2) matches that are spread out, and return its fundamental matrix.
 
-    The class is "unrelated" (no model explains enough), "static" (nothing moves), "rotation" of the
-    camera, "plane" (or a rotation, if there is no calibration), or "depth". Matches must be spread
-    out because adjacent ones are not independent evidence.
+    The class is one of "unrelated" (no model explains enough matches), "static" (nothing moves),
+    "rotation" (the camera only rotated), "plane" (without a calibration also a rotation), and
+    "depth". The matches must be spread out, because adjacent ones are not independent evidence.
     """
     plane, epipolar = (
         fit_model(points0, points1, model, size1, SCENE_THRESHOLDS_PX[model], seed)
@@ -146,20 +152,20 @@ def is_planar(
     epipolar: TwoViewModel,
     seed: int = 0,
 ) -> bool:
-    """Return whether a homography explains the correct matches; many matches may be wrong."""
+    """Return whether the homography `plane` explains the correct ones among (M, 2) matches."""
     least = MIN_PLANAR_RATIO * np.count_nonzero(epipolar.inliers)
     if plane.matrix is None or np.count_nonzero(plane.inliers) < least:
         return False
-    # Not `shows_depth`, which counts all matches off the plane, including wrong ones.
+    # `parallax.shows_depth` is not used: it counts all matches off the plane, also wrong ones.
     parallax = measure_parallax(points0, points1, plane.matrix, seed)
     return not parallax.exceeds(MIN_FRACTION_OF_PLANE)
 
 
 def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool:
-    """Return whether something stands in front of the plane, however small.
+    """Return whether something stands in front of the plane, even if it is small.
 
-    `off_plane_px` are (M,) transfer errors, `by_fundamental` the (M,) bool inliers of the
-    fundamental matrix.
+    `off_plane_px` are the (M,) transfer errors of the homography. `by_fundamental` is (M,) bool,
+    True for the inliers of the fundamental matrix.
     """
     clear = off_plane_px > FOREGROUND_DISTANCE_PX
     foreground = np.count_nonzero(clear & by_fundamental)
@@ -171,7 +177,7 @@ def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool
 
 
 def is_static(motion_px: np.ndarray) -> bool:
-    """Return whether both images show the same view, by the distances that matches move."""
+    """Return whether two images show the same view, given the distances that matches move."""
     motion = np.abs(motion_px)
     return bool(
         np.median(motion) < MAX_MEDIAN_MOTION_PX
@@ -180,7 +186,7 @@ def is_static(motion_px: np.ndarray) -> bool:
 
 
 def is_pure_rotation(points0: np.ndarray, points1: np.ndarray, calibration: Calibration) -> bool:
-    """Return whether one rotation maps the rays of matches onto each other (Kabsch's method)."""
+    """Return whether a rotation maps the first image's rays to those of their matches (Kabsch)."""
     rays0, rays1 = (
         rays / np.linalg.norm(rays, axis=1, keepdims=True)
         for rays in (calibration.camera0.rays(points0), calibration.camera1.rays(points1))
@@ -193,7 +199,7 @@ def is_pure_rotation(points0: np.ndarray, points1: np.ndarray, calibration: Cali
 
 
 def is_usual_rotation(points0: np.ndarray, points1: np.ndarray, sizes: tuple[Size, Size]) -> bool:
-    """Return whether a rotation of one camera of usual focal length explains (M, 2) matches."""
+    """Return whether a rotation explains (M, 2) matches at one of `START_FOCAL_LENGTHS`."""
     for focal in START_FOCAL_LENGTHS:
         cameras = [Camera(size, focal * max(size)) for size in sizes]
         if is_pure_rotation(points0, points1, Calibration(cameras[0], cameras[1])):

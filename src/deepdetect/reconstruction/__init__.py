@@ -1,4 +1,4 @@
-"""Reconstruction of two images: calibration, pose, triangulation, and checks."""
+"""Reconstruct 3D points from two images: calibration, pose, triangulation, and checks."""
 
 import lazy_loader
 

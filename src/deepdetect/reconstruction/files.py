@@ -1,4 +1,4 @@
-"""The files of a reconstruction of two images."""
+"""Write the files of a reconstruction of two images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ENDINGS = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", "_depth.jpg", ".jso
 def save_reconstruction(
     found: Reconstruction, paths: Mapping[str, Path], title: str, **values: Any
 ) -> dict[str, Any]:
-    """Write the files of all `ENDINGS`; return the contents of the JSON, including `values`."""
+    """Write a file for each of `ENDINGS`; return what the JSON contains, including `values`."""
     started = time.perf_counter()
     summary = found.summary()
     notes = {

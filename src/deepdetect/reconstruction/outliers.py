@@ -1,9 +1,10 @@
-"""Filters of a point cloud: smallest parallax, and statistical outlier removal (SOR).
+"""Filter the points of a cloud: minimum parallax, and statistical outlier removal (SOR).
 
 SOR is that of PCL and Open3D (Rusu et al., "Towards 3D point cloud based object maps for household
-environments", 2008), but in `disparity_space`, where points of a stereo pair are evenly spaced. On
-a street of 2 to 125 baselines with 3 % outliers it removed 96 % of them and no other points; in 3D
-space it would have removed 10 % of them, and 1.8 % of the other points.
+environments", 2008), but in `disparity_space`, where the points of a stereo pair are evenly spaced.
+In a street scene with depths of 2 to 125 baselines and 3 % outliers, it removed 96 % of the
+outliers and no other points. In 3D space it would have removed 10 % of the outliers, and 1.8 % of
+the other points.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 
 FLANN_INDEX_KDTREE_SINGLE = 4
-"""FLANN's number of the kd-tree that is exact in few dimensions."""
+"""FLANN's code for an index with a single kd-tree, which is exact in few dimensions."""
 
 SOR_DISPARITY_WEIGHT = 2.0
-"""One pixel of disparity counts as this many pixels across in `disparity_space`. Chosen by hand."""
+"""A difference of one pixel in disparity counts as much as this number of pixels in x or y, in
+`disparity_space`. Chosen by hand."""
 
 QUERIES = 200_000
-"""Neighbours are looked up for this number of points at a time, to bound the memory."""
+"""The neighbours of at most this number of points are searched at once, to bound the memory."""
 
 
 @suggest_keywords
@@ -31,11 +33,14 @@ class PointFilterOptions:
     """Which triangulated points are kept.
 
     Attributes:
-        min_parallax_px: smallest angle between the rays of a point, in pixels, as smaller ones do
-            not determine a depth; for rectified pairs, the smallest disparity (with the offset).
-        sor_neighbors: number of nearest points that SOR compares with, in `disparity_space`; 0
-            turns SOR off, also for rectified pairs.
-        sor_std_ratio: standard deviations above the mean distance at which a point is an outlier.
+        min_parallax_px: minimum angle between the two rays of a point, in pixels (radians times
+            the focal length), because smaller angles do not determine a depth. For rectified pairs,
+            it is the minimum disparity, including the disparity offset.
+        sor_neighbors: number of nearest neighbours in `disparity_space` with which SOR compares a
+            point; 0 turns SOR off. For rectified pairs SOR compares a point with all others in a
+            window of pixels instead, but 0 also turns it off.
+        sor_std_ratio: a point is an outlier if its distance from its neighbours is above the mean
+            of all points by more than this number of standard deviations.
 
     Raises:
         OptionError: a value is out of its range.
@@ -52,7 +57,7 @@ class PointFilterOptions:
 def sor_inliers(
     points: np.ndarray, point_filter: PointFilterOptions = PointFilterOptions()
 ) -> np.ndarray:
-    """Return (N,) bool: which points (N, 3) are no statistical outliers."""
+    """Return (N,) bool, True for those of (N, 3) points that are not statistical outliers."""
     if len(points) < 2:
         return np.ones(len(points), bool)
     distances = mean_neighbor_distances(points, point_filter.sor_neighbors)
@@ -61,9 +66,10 @@ def sor_inliers(
 
 
 def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
-    """Return the mean distance of each of (N, 3) finite points to its nearest others, (N,) float64.
+    """Return the mean distance of each point to its nearest neighbours, (N,) float64.
 
-    OpenCV's FLANN has a single kd-tree, which is exact, and faster than SciPy's on 850,000 points.
+    The points are (N, 3) and must be finite. Neighbours are found by a kd-tree of OpenCV's FLANN,
+    which is exact, and on 850,000 points faster than the one of SciPy.
     """
     points = np.asarray(points, np.float64)
     centred = np.ascontiguousarray(points - points.mean(0), np.float32)
@@ -73,13 +79,13 @@ def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
     for start in range(0, len(centred), QUERIES):
         some = centred[start : start + QUERIES]
         _, squares = tree.knnSearch(some, count, params={"checks": -1})
-        # The nearest point is the point itself, or one in the same place.
+        # Column 0 is left out: it is the point itself, or another one in the same place.
         means[start : start + QUERIES] = np.sqrt(squares[:, 1:].astype(np.float64)).mean(1)
     return means
 
 
 def disparity_space(points: np.ndarray, focal_px: float, baseline: float = 1.0) -> np.ndarray:
-    """Return (N, 3) points as (x, y, weight * disparity) in pixels of the first camera."""
+    """Return (N, 3) points as rows (x, y, weight * disparity) in pixels of the first camera."""
     across = points[:, :2] / points[:, 2:] * focal_px
     disparity = focal_px * baseline / points[:, 2]
     return np.column_stack([across, SOR_DISPARITY_WEIGHT * disparity])

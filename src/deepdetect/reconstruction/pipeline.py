@@ -1,7 +1,8 @@
-"""Reconstruction of coloured 3D points from two images (paper, Figure 8).
+"""Reconstruct coloured 3D points from two images, as in Figure 8 of the DeepDetect paper.
 
-General pairs: keypoints -> matches -> pose -> triangulation -> checks. Rectified pairs: a dense
-disparity map, from which the keypoints of the left image become points.
+For a pair that is not rectified, the steps are keypoints, matches, checks, pose and triangulation.
+For a rectified pair a dense disparity map is computed, and its values at the keypoints of the left
+image give the points.
 """
 
 from __future__ import annotations
@@ -41,12 +42,14 @@ from .result import Reconstruction
 from .two_view import checked_pose, reconstruct_two_view, refined_corners
 
 SOR_WINDOW_PX = 9
-"""SOR of rectified pairs compares a pixel with those in a window of this side. Chosen by hand."""
+"""Statistical outlier removal (SOR) compares a pixel of a rectified pair with the others in a
+window with this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
-"""Fractions of the keypoints that must have a match on their row. The first is for unique matches:
-unrelated images had up to 0.005, rectified pairs at least 0.35. The second is for matches that need
-not be unique: unrelated images had up to 0.16, rectified pairs at least 0.64."""
+"""These are the minimum fractions of keypoints with a match on their row. MIN_UNIQUE_FRACTION
+applies if matches must be unique: the fraction was up to 0.005 for unrelated images, and at least
+0.35 for rectified pairs. MIN_MATCHED_FRACTION applies if they need not be unique: the fraction was
+up to 0.16 for unrelated images, and at least 0.64 for rectified pairs."""
 
 
 @suggest_keywords
@@ -67,27 +70,28 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct a scene from two images.
 
-    For a rectified pair the detector only chooses which pixels of a dense disparity map become
-    points; `disparity_map` gives that map without a detector.
+    For a rectified pair a dense disparity map is computed, and the detector only chooses which of
+    its pixels become points. `disparity_map` computes that map without a detector.
 
     Args:
         image0, image1: anything `load_image` takes. The points are in the frame of the first
             camera, which is the left one of a rectified pair.
         detector: a detector as in `match_images`; default `DeepDetect("dense")`.
         channels: order of the colours in images that are arrays, as in `load_image`.
-        calibration: file of the cameras. A `Calibration` also works. By default the focal length is
-            `focal_px`, or that of EXIF.
+        calibration: camera file, such as calib.json. A `Calibration` also works. By default the
+            focal length is `focal_px`, or is read from the EXIF data of the images.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
-        rectified: whether matches lie on the same row of both images. None: detected.
-        selection: which pixels of a heat map become keypoints; None: those over 0.5. A density of 1
-            takes every pixel, and `DENSE` disparities; `subpixel` does not apply.
-        ignore: masks as in `match_images`; for a rectified pair, only that of the left image.
+        rectified: whether matches lie on the same row of both images. None detects it.
+        selection: which pixels of a heat map become keypoints; None takes those with a probability
+            above 0.5. With a density of 1, every pixel of a rectified pair becomes a point, with
+            the disparity options `DENSE`. `subpixel` is ignored.
+        ignore: masks as in `match_images`; for a rectified pair, only the mask of the left image.
         seed: seed of all random choices.
         point_filter: which points are kept.
         progress: called with the name of each stage when it ends.
 
     Returns:
-        The points, with statistics about them.
+        The points, and how they were found.
 
     Raises:
         ImageError: an image cannot be read or used.
@@ -123,7 +127,7 @@ def reconstruct(
             )
     detector = DeepDetect("dense") if detector is None else detector
     masks = ignore_masks(ignore, 2)
-    # Matches and disparities start at whole pixels of the left image.
+    # Matches and disparities are computed at whole pixels of the left image.
     whole = None if selection is None else replace(selection, subpixel=False)
     if rectified:
         with timer.stage("keypoints"):
@@ -175,19 +179,21 @@ def estimate_pose(
         image0, image1: anything `load_image` takes.
         detector: a detector as in `match_images`; default `DeepDetect()`.
         channels: order of the colours in images that are arrays, as in `load_image`.
-        calibration: file of the cameras. A `Calibration` also works. By default the focal length is
-            `focal_px`, or that of EXIF.
+        calibration: camera file, such as calib.json. A `Calibration` also works. By default the
+            focal length is `focal_px`, or is read from the EXIF data of the images.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         seed: seed of all random choices.
         progress: called with the name of each stage when it ends.
 
     Returns:
-        Rotation and translation: X1 = rotation @ X0 + translation, of unknown length.
+        Rotation and translation: X1 = rotation @ X0 + translation. The translation has length 1,
+        because its true length is unknown.
 
     Raises:
         ImageError: an image cannot be read or used.
-        ReconstructionError: there is no calibration, or it is wrong; as a NoDepthError, the images
-            show one plane, or the camera only rotated, so the pose is undetermined.
+        ReconstructionError: there is no calibration, or it is wrong.
+        NoDepthError: the images do not overlap or show one plane, or the camera did not move or
+            only rotated, so the matches do not determine the pose.
 
     Example:
         >>> import cv2
@@ -223,7 +229,7 @@ def _from_disparities(
     point_filter: PointFilterOptions,
     timer: StageTimer,
 ) -> dict[str, Any]:
-    """Reconstruct the left keypoints of a rectified pair; return the fields of `Reconstruction`."""
+    """Compute points at the left keypoints of a rectified pair; return `Reconstruction` fields."""
     check_cameras(calibration)
     keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
     if not len(keypoints):
@@ -282,11 +288,11 @@ def sor_inliers_on_grid(
     size: tuple[int, int],
     point_filter: PointFilterOptions = PointFilterOptions(),
 ) -> np.ndarray:
-    """Return (N,) bool: which pixels (N, 2) of a rectified pair are no statistical outliers.
+    """Return (N,) bool, True for (N, 2) pixels of the left image that are not statistical outliers.
 
-    This is `sor_inliers` with all pixels of a window as neighbors. The distance is the root mean
-    square of the differences of disparity, which takes three box filters. A pixel alone in its
-    window is an outlier only if most pixels are not alone.
+    This is like `sor_inliers`, but the neighbours of a pixel are all others in a window. Its
+    distance from them is the root mean square of the differences in disparity, which three box
+    filters compute. A pixel without neighbours is an outlier only if most pixels have some.
     """
     if not len(pixels):
         return np.ones(0, bool)
@@ -314,7 +320,7 @@ def _load_pair(
     calibration: Calibration | str | Path | None,
     focal_px: float | None,
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], Calibration]:
-    """Return two images as RGB and as luma, and their calibration."""
+    """Load two images; return them as RGB and as luma, and their calibration."""
     rgb = load_image(images[0], channels=channels), load_image(images[1], channels=channels)
     grays = luma(rgb[0]), luma(rgb[1])
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
@@ -327,7 +333,7 @@ def _calibration(
     images: tuple[Any, Any],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> Calibration:
-    """Return the given calibration, or the one in the EXIF of the images."""
+    """Return the given calibration, or make one from `focal_px` or the EXIF data of the images."""
     if given is not None and focal_px is not None:
         raise OptionError("give `calibration` or `focal_px`, not both")
     if isinstance(given, Calibration):
@@ -335,7 +341,7 @@ def _calibration(
         return given
     if given is not None:
         names = [str(image) if isinstance(image, (str, Path)) else "" for image in images]
-        left, right = (re.search(r"image_0?(\d)\b", name) for name in names)  # names of KITTI
+        left, right = (re.search(r"image_0?(\d)\b", name) for name in names)  # file names of KITTI
         views = (int(left[1]), int(right[1])) if left and right else None
         return Calibration.load(given, *sizes, views=views)
     if focal_px is not None:

@@ -1,7 +1,8 @@
-"""Recognition of rectified pairs, and checks that such a pair is right and has depth.
+"""Recognise rectified pairs, and check that the calibration fits and that they show depth.
 
-Matches of a rectified pair lie on the same row of both images. This model without parameters must
-explain about as many matches as the best models with parameters do.
+The matches of a rectified pair lie on the same row in both images. This rule has no parameters. A
+pair is rectified if the rule explains about as many matches as the best models with parameters,
+which are a fundamental matrix and rows that are shifted, tilted and scaled.
 """
 
 from __future__ import annotations
@@ -19,89 +20,99 @@ from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_st
 from ..matching.guided import TentativeMatches, find_tentative_matches
 
 MAX_ROW_DISTANCE_PX = 1.0
-"""Matches of a rectified pair may be off their row by this much. Chosen by hand."""
+"""A match of a rectified pair may lie at most this far from its row. Chosen by hand."""
 
 MIN_INLIER_RATIO = 0.9
-"""Rows must explain this share of the matches that the best other model does. Chosen by hand."""
+"""A pair is rectified only if the number of matches on the same row is at least this fraction of
+the number that the best model with parameters explains. Chosen by hand."""
 
 MIN_DISPARITY_SPREAD_PX = 2.0
-"""Disparities of a pair with depth must spread by this much from the 5th to the 95th percentile:
-matches at whole pixels always spread by 1."""
+"""A pair is rectified only if its disparities spread by at least this from the 5th to the 95th
+percentile. Matches at whole pixels always spread by 1, because their positions are rounded."""
 
 MIN_PLANAR_SPREAD_PX = 8.0
-"""If one homography explains a pair, its disparities must spread by this much. Disparities of a
-slanted plane do, those of a camera that only rotated a little spread less."""
+"""If one homography explains all matches of a pair, the pair is rectified only if its disparities
+spread by at least this. Those of a slanted plane do; those of a camera that only rotated a little
+spread less than this."""
 
 GRID_SIZE_PX = 8
-"""Each cell of the left image of this size gives one match. Chosen by hand."""
+"""The left image is divided into cells of this side. Each gives one match. Chosen by hand."""
 
 ITERATIONS = 500
-"""RANSAC draws this number of samples of three matches for `_best_other_rows`. Chosen by hand."""
+"""RANSAC in `_best_other_rows` draws this number of samples of three matches. Chosen by hand."""
 
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 480, 1000
-"""The first pass matches copies with this longer side and number of keypoints. Chosen by hand."""
+"""The coarse pass, which comes first, matches copies of the images whose longer side is
+COARSE_SIDE_PX, with at most COARSE_KEYPOINTS keypoints in each. Chosen by hand."""
 
 MIN_COARSE_INLIERS = 50
-"""The coarse pass decides only if a fundamental matrix explains this number of its matches. Chosen
-by hand."""
+"""The coarse pass decides only if a fundamental matrix explains at least this number of its
+matches. Chosen by hand."""
 
 MAX_COARSE_ROW_ERROR_PX = 0.6
-"""The coarse pass accepts a pair only if its rows are off by less at `MIN_INLIER_RATIO` of the
-matches, in pixels of the full images: many matches together are more accurate than each alone."""
+"""The coarse pass accepts a pair as rectified only if its `_row_error` is below this, in pixels of
+the full images. The limit can be below 1, because that error is computed from all matches together,
+which are more accurate than each match alone."""
 
 MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
-"""Focal lengths of rectified views may differ by this fraction, so that values given to three
-digits pass. A row 200 px from the middle is then off by 2 px."""
+"""The focal lengths of rectified views may differ by at most this fraction, so that values rounded
+to three digits pass. If they differ by this much, a row 200 px from the middle is off by 2 px."""
 
 MAX_CY_DIFFERENCE_PX = 2.0
-"""cy of rectified views may differ by this, twice the distance that a match may be off its row."""
+"""The values of cy of two rectified views may differ by at most this, which is twice the distance
+that a match may lie from its row."""
 
 MIN_DEPTH_SPREAD_PX = 0.5
-"""Disparities of a scene with depth spread by more, from the 5th to the 95th percentile. Chosen by
-hand."""
+"""A pair shows depth only if its disparities spread by at least this from the 5th to the 95th
+percentile. Chosen by hand."""
 
 MIN_DISPARITY_PX = -1.0
-"""A point is behind the cameras if its disparity plus the calibration's offset is below this. One
-pixel is allowed for noise."""
+"""A point lies behind the cameras if its disparity plus the disparity offset of the calibration is
+below this. One pixel is allowed for noise."""
 
 MAX_BEHIND_FRACTION = 0.25
-"""A calibration is wrong if a larger fraction of points lies behind the cameras. Chosen by hand."""
+"""A calibration is wrong if more than this fraction of the points lies behind the cameras. Chosen
+by hand."""
 
 MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
-"""A rotation explains a disparity up to the first error. It explains a pair if it explains more
-than the second share of the disparities, which was 0.64 or more for four views rotated by half a
-degree to two."""
+"""A rotation explains a disparity if its error is below MAX_ROTATION_ERROR_PX. A pair is rejected
+as a pure rotation only if the best rotation explains more than MIN_ROTATION_FRACTION of its
+disparities. For four views that were rotated by 0.5 to 2 degrees, the fraction was 0.64 or more."""
 
 MAX_RATIO_TO_PLANE = 0.5
-"""The median error of the rotation, divided by that of the best plane in disparity, must be below
-this. The ratio was up to 0.33 for rotated views, and at least 5.3 for slanted walls."""
+"""A pair is rejected as a pure rotation only if the median error of the disparities under the best
+rotation, divided by that under the best plane, is below this. The ratio was up to 0.33 for rotated
+views, and at least 5.3 for slanted walls."""
 
 MAX_OFF_ROW_PX = 1.0
-"""Matches are found on rows. A rotation may move them off their rows by this median distance."""
+"""Disparities come from matches on the same row, so a rotation cannot explain them if the median
+distance by which it moves points off their rows is above this."""
 
 ROBUST_ITERATIONS = 12
 
 ROTATION_GRID_SIZE_PX, MIN_ROTATION_MATCHES, MAX_ROTATION_SAMPLES = 16, 30, 50_000
-"""A rotation is fitted to one disparity per cell of the first size, if there are at least the
-second number of them. If there are more disparities than the third number, a random sample is used.
-Chosen by hand."""
+"""A rotation is fitted to one disparity from each cell with the side ROTATION_GRID_SIZE_PX, if this
+gives at least MIN_ROTATION_MATCHES disparities. Before that, if there are more disparities than
+MAX_ROTATION_SAMPLES, a random sample of that number is taken. Chosen by hand."""
 
 
 @dataclass(frozen=True)
 class Rectification:
-    """Whether a pair is rectified, and the figures behind that decision.
+    """Whether a pair is rectified, and the numbers on which that decision is based.
 
     Attributes:
         rectified: whether the pair is rectified.
-        reason: why it is not rectified, or empty.
-        swapped: the pair is rectified, but left and right are exchanged.
-        on_rows: number of `matches` whose rows differ by at most one.
-        by_fundamental: number of matches that a fundamental matrix explains as closely.
-        by_other_rows: number of matches on rows that are shifted, tilted and scaled.
-        matches: number of matches that were used, one per cell.
-        vertical_offset: median of y in the second minus y in the first image, in pixels, of the
-            matches that the fundamental matrix explains.
-        disparities: 5th percentile, median and 95th percentile in pixels on rows, or NaN.
+        reason: why the pair is not rectified; empty if it is.
+        swapped: whether the pair is rectified, but left and right are exchanged.
+        on_rows: number of `matches` whose rows in the two images differ by at most one pixel.
+        by_fundamental: number of matches that a fundamental matrix explains as accurately.
+        by_other_rows: number of matches that rows explain if they may be shifted, tilted and scaled
+            between the images.
+        matches: number of matches that were used, one per cell of the left image.
+        vertical_offset: median of y in the second image minus y in the first, in pixels, of the
+            matches that the fundamental matrix explains; NaN if there are none.
+        disparities: 5th percentile, median and 95th percentile of the disparities of the matches on
+            rows, in pixels; NaN if there are none.
     """
 
     rectified: bool
@@ -118,10 +129,10 @@ class Rectification:
 def find_rectification(
     gray0: np.ndarray, gray1: np.ndarray, offset_px: float = 0.0, seed: int = 0
 ) -> tuple[Rectification, TentativeMatches | None]:
-    """Decide whether two images (H, W) are rectified, from small copies if these are decisive.
+    """Decide whether two (H, W) images are a rectified pair, from small copies if these suffice.
 
-    `offset_px` is added to a disparity before it gives a depth. Also returns the tentative matches
-    of larger copies, if they were needed.
+    `offset_px` is the disparity offset of the calibration. If small copies do not suffice, the
+    tentative matches of larger copies are also returned, else None.
     """
     size = gray0.shape[::-1]
     if gray0.shape != gray1.shape:
@@ -140,12 +151,12 @@ def find_rectification(
 def _coarse_pass(
     gray0: np.ndarray, gray1: np.ndarray, offset_px: float, seed: int
 ) -> Rectification | None:
-    """Decide from small copies of two images of one size; None if these are not decisive."""
+    """Decide from small copies of two images of the same size; None if these do not suffice."""
     coarse = find_tentative_matches(
         gray0, gray1, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
     )
     scale, size = coarse.scales[0], coarse.views[0].shape[::-1]
-    # The thresholds are in pixels of the copies, so they leave a margin at full size.
+    # A distance of 1 px in the copies is more at full size, so the limit for rows is generous.
     found = detect_rectification(*coarse.matched, size, offset_px * scale, seed)
     if found.by_fundamental < MIN_COARSE_INLIERS:
         return None
@@ -155,7 +166,7 @@ def _coarse_pass(
         decided = on_rows and _row_error(*coarse.matched, seed) < limit
     else:
         best = max(found.by_fundamental, found.by_other_rows)
-        # The margin is three standard deviations of a binomial distribution.
+        # Rejection needs a margin of three standard deviations of a binomial distribution.
         deviation = np.sqrt(best * MIN_INLIER_RATIO * (1 - MIN_INLIER_RATIO))
         decided = found.on_rows < MIN_INLIER_RATIO * best - 3 * deviation
     if not decided:
@@ -167,11 +178,12 @@ def _coarse_pass(
 
 
 def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
-    """Return the error in pixels of the rows of a pair that looks rectified, as a high quantile.
+    """Return the `MIN_INLIER_RATIO` quantile of the row errors of a pair that looks rectified.
 
-    A single match is too inaccurate for this. So a function of position (for rotated views and lens
-    distortion) and disparity (for a camera that also moved up or down) is fitted to the distances
-    of all matches from their rows.
+    The row error is how many pixels the rows of the two images are off at a position. A single
+    match is too inaccurate to tell it. Therefore a smooth function is fitted to the distances of
+    all matches from their rows, and its values are used. It depends on the position (for rotated
+    views and lens distortion) and on the disparity (for a camera that also moved up or down).
     """
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
@@ -190,14 +202,14 @@ def detect_rectification(
     offset_px: float = 0.0,
     seed: int = 0,
 ) -> Rectification:
-    """Decide from matches (M, 2) whether a pair of images of one (width, height) is rectified."""
+    """Decide from (M, 2) matches whether a pair of images of one (width, height) is rectified."""
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
     limit = MAX_ROW_DISTANCE_PX
     on_rows = np.abs(second[:, 1] - first[:, 1]) <= limit
-    # For a rectified pair, Sampson's distance is the difference of the rows over the root of 2.
+    # In a rectified pair, the Sampson distance is the difference of the rows divided by sqrt(2).
     epipolar = fit_model(first, second, "fundamental", size, limit / np.sqrt(2), seed)
     other_rows = _best_other_rows(first, second, size, seed)
     disparity = (first - second)[on_rows, 0]
@@ -210,7 +222,8 @@ def detect_rectification(
     )
     best = max(by_fundamental, by_other_rows)
     reason = ""
-    # The test for fundamental matrices allows for sampling; rows are not sampled, so it is strict.
+    # This NFA counts the samples from which a fundamental matrix is chosen. The rule of rows is
+    # not chosen from samples, so for it the test is stricter than necessary.
     if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     elif on_rows_count < MIN_INLIER_RATIO * best:
@@ -243,9 +256,10 @@ def detect_rectification(
 def _best_other_rows(
     points0: np.ndarray, points1: np.ndarray, size: tuple[int, int], seed: int
 ) -> np.ndarray:
-    """Fit the vertical shift as a plane over the image by RANSAC; return its inliers, (M,) bool.
+    """Fit y1 - y0 as a linear function of x0 and y0 by RANSAC; return its (M,) bool inliers.
 
-    A sample has three matches, not seven as for a fundamental matrix: it tolerates more outliers.
+    These are rows that are shifted, tilted and scaled. A sample has only three matches, while one
+    for a fundamental matrix has seven, so more outliers are tolerated.
     """
     shift = points1[:, 1] - points0[:, 1]
     best = np.zeros(len(points0), bool)
@@ -267,7 +281,7 @@ def _best_other_rows(
 
 
 def check_cameras(calibration: Calibration) -> None:
-    """Raise a ReconstructionError if focal lengths or cy of both views differ."""
+    """Raise a ReconstructionError if the two views differ too much in focal length or cy."""
     camera0, camera1 = calibration.camera0, calibration.camera1
     pairs = [
         ("the focal lengths", focal0, focal1, MAX_FOCAL_DIFFERENCE_FRACTION * focal0)
@@ -300,10 +314,10 @@ def check_pure_rotation(
 ) -> None:
     """Raise a NoDepthError if a rotation explains the disparities far better than a plane does.
 
-    A rotation by an angle a about the vertical moves pixels along their rows by f a (1 + x^2) to
-    first order, where x is the slope of the ray: like a wall, but curved. The rotation is not
-    noticed if the focal length is far off, the camera also tilted, or the curvature is below the
-    noise.
+    To first order, a rotation by an angle a about the vertical moves pixels along their rows by
+    f a (1 + x^2), where f is the focal length and x the horizontal slope of the ray. So the
+    disparities are like those of a wall, but curved. The rotation is not noticed if f is far off,
+    if the camera was also tilted, or if the curvature is smaller than the noise.
     """
     chosen = np.arange(len(pixels))
     if len(chosen) > MAX_ROTATION_SAMPLES:
@@ -323,7 +337,7 @@ def check_pure_rotation(
 
 
 def check_depths(disparity: np.ndarray, calibration: Calibration) -> None:
-    """Raise a ReconstructionError if many points of a rectified pair are behind the cameras."""
+    """Raise a ReconstructionError if many points of a rectified pair lie behind the cameras."""
     offset = calibration.disparity_offset_px
     behind = float(np.mean(disparity + offset < MIN_DISPARITY_PX))
     if behind > MAX_BEHIND_FRACTION:
@@ -336,15 +350,16 @@ def check_depths(disparity: np.ndarray, calibration: Calibration) -> None:
 def _rotation_errors(
     pixels: np.ndarray, disparity: np.ndarray, calibration: Calibration
 ) -> np.ndarray:
-    """Fit a rotation to disparities robustly; return the residuals (N,) in pixels.
+    """Fit a rotation robustly to the disparities at (N, 2) pixels; return (N,) errors in pixels.
 
-    The axes are the vertical and the optical axis: a tilt hardly changes disparities. Residuals are
-    infinite if the rotation moves the matches off their rows.
+    Only rotations about the vertical and the optical axis are fitted, because a tilt about the
+    horizontal axis hardly changes disparities. All errors are infinite if the rotation moves the
+    matches off their rows.
     """
     camera, rays = calibration.camera1, calibration.camera0.rays(pixels)
     matched = pixels - np.column_stack([disparity, np.zeros(len(disparity))])
     wanted = camera.rays(matched)[:, 0]
-    # The median rotation about the vertical is close enough as a start.
+    # Each match gives an angle about the vertical. Their median is a good enough start.
     angle = np.median(np.arctan(wanted) - np.arctan(rays[:, 0]))
     rotation = cv2.Rodrigues(np.array([0, angle, 0]))[0]
     for _ in range(ROBUST_ITERATIONS):
@@ -358,7 +373,7 @@ def _rotation_errors(
 
 
 def _plane_errors(pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-    """Fit a plane to disparities over x and y robustly; return the residuals (N,) in pixels."""
+    """Fit a linear function of x and y robustly to disparities; return (N,) errors in pixels."""
     design = np.column_stack([pixels / max(pixels.max(), 1), np.ones(len(pixels))])
     plane = np.array([0, 0, np.median(disparity)])
     for _ in range(ROBUST_ITERATIONS):

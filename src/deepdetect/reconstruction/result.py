@@ -23,37 +23,39 @@ SCALE = {
     "calib.json)",
 }
 
-SHAPE = "; if cx of both cameras differ, depth without disparity_offset_px has a wrong shape"
-"""This warning is for a rectified pair whose calibration does not give the offset."""
+SHAPE = "; if the cameras differ in cx, depths are wrong unless disparity_offset_px is given"
+"""This warning is for a rectified pair whose calibration does not state the disparity offset."""
 
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction:
-    """3D points of two images, and how they were found.
+    """3D points from two images, and how they were found.
 
     Attributes:
         points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
         colors: (N, 3) uint8 sRGB of the left image.
         pixels: (N, 2) float32 positions of the points in the left image.
-        disparity: (N,) float32 in pixels for rectified pairs, else None: the match of the left
-            (x, y) is the right (x - disparity, y).
-        matched: (N,) bool: seen in both images. False for points filled in from a surface next to
-            them, because the right camera does not show them or they are at the edge of an
-            occluding surface (only if every pixel of a rectified pair becomes a point).
-        unit: "mm" if the baseline is known, else "baseline": the distance of the cameras is 1, and
-            the true scale is not known.
+        disparity: (N,) float32 in pixels for rectified pairs, else None. The match of (x, y) in
+            the left image is (x - disparity, y) in the right image.
+        matched: (N,) bool, True for points that were matched in both images. The others got the
+            depth of a surface next to them, because the right image does not show them or they
+            are at the edge of an occluding surface. Such points exist only if every pixel of a
+            rectified pair becomes a point.
+        unit: "mm" if the baseline is known. Otherwise "baseline": the distance between the cameras
+            is 1, and the true scale is not known.
         size: (width, height) of the left image.
         rectified: whether the pair was treated as rectified.
-        rectification: the figures behind that decision; None if the caller decided.
+        rectification: the numbers on which that decision is based; None if the caller decided.
         calibration: intrinsics and baseline of the cameras.
-        pose: pose of the right camera for pairs that are not rectified, else None.
-        reprojection_errors: (N,) float32 for pairs that are not rectified, else None: distance
-            of the points from their matches, in pixels (root mean square of both images).
+        pose: pose of the right camera if the pair is not rectified, else None.
+        reprojection_errors: (N,) float32 distances, in pixels, of the projected points from their
+            matched positions (root mean square of both images) if the pair is not rectified,
+            else None.
         keypoints: number of keypoints in the left image.
         matches: number of matches that were triangulated.
-        dropped: number of matches that each check removed, in order.
-        seconds: time of each stage.
+        dropped: number of matches that each check removed, in the order of the checks.
+        seconds: time that each stage took.
     """
 
     points: np.ndarray
@@ -91,14 +93,14 @@ class Reconstruction:
 
     @property
     def baseline_vector(self) -> np.ndarray:
-        """(3,) float64 from the left to the right camera centre, in the frame of the points."""
+        """Vector from the left camera centre to the right one, (3,), in the left camera's frame."""
         length = 1.0 if self.calibration.baseline_mm is None else self.calibration.baseline_mm
         if self.pose is None:
             return np.array([length, 0, 0])
         return -length * (self.pose.rotation.T @ self.pose.translation)
 
     def triangulation_angles(self) -> np.ndarray:
-        """Return the angle at each point between the rays to both cameras, (N,) in degrees."""
+        """Return the angle at each point between the rays to the two cameras, (N,) in degrees."""
         points = self.points.astype(np.float64)
         return np.degrees(angles_between(points, points - self.baseline_vector))
 
@@ -107,7 +109,7 @@ class Reconstruction:
         return self._map(self.points[:, 2])
 
     def disparity_map(self) -> np.ndarray:
-        """Return the disparity at each pixel of the left image; NaN if unknown.
+        """Return the disparity at each pixel of the left image, (H, W) float32; NaN if unknown.
 
         Raises:
             ReconstructionError: the pair is not rectified.
@@ -117,11 +119,11 @@ class Reconstruction:
         return self._map(self.disparity)
 
     def matched_map(self) -> np.ndarray:
-        """Return (H, W) bool: pixels whose point was seen in both images, not filled in."""
+        """Return (H, W) bool, True for pixels whose point was matched in both images."""
         return self._map(self.matched.astype(np.float32)) == 1
 
     def summary(self) -> dict[str, Any]:
-        """Return everything except the arrays as plain values for JSON; NaN becomes None."""
+        """Return plain values for JSON, with statistics of the arrays; NaN becomes None."""
         errors, disparity = self.reprojection_errors, self.disparity
         rows, pose, calibration = self.rectification, self.pose, self.calibration
         cameras = {"left": calibration.camera0, "right": calibration.camera1}
@@ -167,7 +169,7 @@ class Reconstruction:
         }
 
     def _map(self, values: np.ndarray) -> np.ndarray:
-        """Return values of the points at their pixels, (H, W) float32, NaN elsewhere."""
+        """Return an (H, W) float32 map of the points' values at their pixels, NaN elsewhere."""
         result = np.full(self.size[::-1], np.nan, np.float32)
         columns, rows = np.rint(self.pixels).astype(np.int64).T
         result[rows, columns] = values
@@ -193,7 +195,7 @@ def _percentiles(values: np.ndarray) -> dict[str, float]:
 
 
 def _finite(value: Any) -> Any:
-    """Replace numbers that are not finite, which JSON cannot hold, by None."""
+    """Replace numbers that are not finite by None, because JSON cannot represent them."""
     if isinstance(value, dict):
         return {name: _finite(part) for name, part in value.items()}
     if isinstance(value, tuple):

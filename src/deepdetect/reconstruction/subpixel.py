@@ -1,9 +1,10 @@
-"""Sub-pixel refinement of matches: the patch around a point is aligned to the second image.
+"""Refine matches to sub-pixel accuracy: align the patch around each point to the second image.
 
 The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004), and
-independent of gain and offset. A patch is first warped by a similarity fitted to all matches, then
-by an affinity fitted to the refined matches around it. On Middlebury's Motorcycle, 65 % of the
-converged matches were within 0.25 px; with a parabola through the correlation, 49 % were.
+independent of the gain and offset of the brightness. Each patch is aligned twice. First it is
+warped by a similarity that is fitted to all matches, then by an affinity that is fitted to the
+refined matches around it. On Middlebury's Motorcycle, 65 % of the converged matches were within
+0.25 px of the ground truth. With a parabola through the correlation instead, 49 % were.
 """
 
 from __future__ import annotations
@@ -15,44 +16,47 @@ from .._shared.opencv import cv2
 from ..geometry.images import window_sums
 
 PATCH_RADIUS_PX = 4
-"""A patch has 2 radius + 1 pixels a side, with a Gaussian weight of sigma radius / 2. Chosen by
-hand."""
+"""The side of a patch is 2 * radius + 1 pixels, and its pixels have Gaussian weights with a sigma
+of radius / 2. Chosen by hand."""
 
 MAX_ITERATIONS = 15
-"""Each of the two alignments takes at most this number of steps. Chosen by hand."""
+"""Each of the two alignments of a patch takes at most this number of steps. Chosen by hand."""
 
 MAX_SHIFT_PX = 2.0
-"""A match may move by this much in each of the two alignments. Chosen by hand."""
+"""A match may move by at most this distance in each of the two alignments. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
-"""A match whose patches correlate less in the end has not converged. Chosen by hand."""
+"""A match has converged only if its patches correlate at least this much. Chosen by hand."""
 
 CONVERGENCE_PX, COARSE_CONVERGENCE_PX = 0.01, 0.05
-"""A step below the first number ends the last alignment, one below the second ends the first
-alignment, which only prepares the last."""
+"""The first alignment ends at a step shorter than COARSE_CONVERGENCE_PX, because it only prepares
+the second. The second ends at a step shorter than CONVERGENCE_PX."""
 
 AFFINITY_WINDOW_PX = 15
-"""The affinity of a patch is fitted to the matches in a window of this side. Chosen by hand."""
+"""The affinity of a patch is fitted to the matches in a window with this side. Chosen by hand."""
 
 AFFINITY_REGULARIZATION = 20.0
-"""The similarity weighs as much in the fit of an affinity as this number of matches all over the
-window. So few matches, or matches on one line, give nearly the similarity. Chosen by hand."""
+"""When an affinity is fitted to the matches in a window, the similarity of all matches counts as
+much as this number of matches spread over the window. An affinity that is fitted to few matches, or
+to matches on one line, is therefore close to the similarity. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES = 5000
 """The similarity is estimated from at most this number of matches, to save time."""
 
 CORNER_WINDOW_PX = 7
-"""The strength of a corner is measured in a window of this side, about that of a patch."""
+"""The strength of a corner is measured in a window with this side, about that of a patch."""
 
 
 def refine_matches(
     gray0: np.ndarray, gray1: np.ndarray, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine the second positions (N, 2) of matches, which must be right to a pixel or two.
+    """Refine the (N, 2) positions of matches in the second image to sub-pixel accuracy.
 
-    The first positions are rounded to whole pixels. Returns (N, 2) float64 second positions, and
-    (N,) bool whether they converged. Patches that are flat, cross the border, move too far or stay
-    too different do not converge, and keep their position.
+    The positions in the second image must be accurate to a pixel or two. Those in the first image
+    are rounded to whole pixels. Returns the refined (N, 2) float64 positions, and (N,) bool, True
+    for matches that converged. A match does not converge if its patch is flat, crosses the border,
+    moves too far or stays too different. An alignment that does not converge leaves the position
+    unchanged.
     """
     pixels0 = np.rint(points0).astype(np.int64)
     start = np.array(points1, np.float64, order="C")
@@ -71,7 +75,7 @@ def refine_matches(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Return rows of (N, 2) whole pixels: the best Shi-Tomasi corner in each of `count` cells."""
+    """Return one index into (N, 2) pixels for each of `count` cells: its best Shi-Tomasi corner."""
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
     side = np.sqrt(gray.size / count)
@@ -82,7 +86,7 @@ def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarr
 
 
 def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """Return the rotation and scale, (2, 2) float64, from the first image to the second."""
+    """Return rotation times scale, (2, 2), of a similarity fitted robustly to all matches."""
     every = -(-len(points0) // MAX_SIMILARITY_SAMPLES)
     first, second = (
         np.ascontiguousarray(points[::every], np.float64) for points in (points0, points1)
@@ -103,12 +107,13 @@ def local_affinities(
 ) -> np.ndarray:
     """Fit an affinity to the converged matches in the window around each match.
 
-    Returns (N, 2, 2) float32, near `overall` for few or badly spread matches. `shape` is (H, W) of
-    the first image.
+    Returns (N, 2, 2) float32 matrices from the first image to the second. If there are few matches
+    around a match, or they are badly spread, its matrix is close to `overall`, the (2, 2) matrix of
+    the similarity of all matches. `shape` is (H, W) of the first image.
     """
     pixels0 = np.asarray(pixels0, np.int64)
     column, row = pixels0.T
-    # Sums of squares of large numbers would lose the small differences.
+    # Positions are relative to the middle, as sums of large squares would lose small differences.
     across, down = column - shape[1] / 2, row - shape[0] / 2
     rest = points1 - np.column_stack([across, down]) @ overall.T
     size = AFFINITY_WINDOW_PX
@@ -142,10 +147,11 @@ def align_patches(
     radius_px: int = PATCH_RADIUS_PX,
     max_shift_px: float = MAX_SHIFT_PX,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Align patches of the first image, each warped by its affinity, to the second, in threads.
+    """Align patches of the first image, each warped by its affinity, to the second image.
 
-    Images are (H, W) float32, `pixels0` (N, 2) int64, `start` (N, 2) float64 and `affinities`
-    (N, 2, 2). Returns the same as `refine_matches`.
+    The images are (H, W) float32. `pixels0` are the centres of the patches, (N, 2) int64, `start`
+    their initial positions in the second image, (N, 2) float64, and `affinities` is (N, 2, 2). The
+    patches are divided among threads. Returns the same as `refine_matches`.
     """
     from .subpixel_kernel import align
 

@@ -1,4 +1,4 @@
-"""Compiled kernel of `subpixel`. Importing it loads numba; the first call compiles."""
+"""Compiled kernel of `subpixel`. Importing this module loads numba; the first call compiles it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .._shared.kernels import compiled
 
 @compiled(nogil=True, fastmath=True, inline="always")
 def _cubic(image, x, y):  # type: ignore[no-untyped-def]
-    """Interpolate an image (Keys's cubic, a = -1/2), at least 2 pixels from the border."""
+    """Interpolate (Keys's cubic, a = -1/2) at (x, y), at least 2 pixels from the image border."""
     column, row = np.int64(np.floor(x)), np.int64(np.floor(y))
     u, v = np.float32(x - column), np.float32(y - row)
     a0 = ((np.float32(-0.5) * u + np.float32(1.0)) * u - np.float32(0.5)) * u
@@ -50,8 +50,10 @@ def align(  # type: ignore[no-untyped-def]
     """Refine the matches `first` to `last - 1`; write `refined` and `converged`.
 
     The method is inverse compositional: the patch of the first image is the template, so its
-    derivatives and the normal matrix are computed once. Gain and offset are unknowns next to the
-    shift. Arguments are those of `subpixel.align_patches`; `least` is the smallest correlation.
+    derivatives and the normal matrix are computed only once for each match. The gain and offset of
+    the brightness are estimated together with the shift. The arguments are those of
+    `subpixel.align_patches`, with `window` for the (side, side) weights of a patch and `least` for
+    the minimum correlation of a match that has converged.
     """
     side = window.shape[0]
     radius = side // 2
@@ -85,7 +87,7 @@ def align(  # type: ignore[no-untyped-def]
                 mean_y += weight[j] * sy
                 j += 1
         mean, mean_x, mean_y = mean / total, mean_x / total, mean_y / total
-        # Subtracting the means eliminates the offset; the gain is eliminated next.
+        # Subtracting the means eliminates the offset. The gain is eliminated in the next two loops.
         tt, tx, ty = np.float32(0), np.float32(0), np.float32(0)
         for j in range(count):
             template[j] -= mean
@@ -135,7 +137,8 @@ def align(  # type: ignore[no-untyped-def]
             correlation = ts / np.sqrt(max(ss * tt, np.float32(1e-12)))
             if gain <= 0:
                 break
-            # Slopes are orthogonal to the template, so `seen` leaves the gain times the shift.
+            # The slopes are orthogonal to the template, so `ex` and `ey` depend on the shift alone,
+            # times the gain.
             step_x = (yy * ex - xy * ey) / determinant / gain
             step_y = (xx * ey - xy * ex) / determinant / gain
             x1 -= a * step_x + b * step_y

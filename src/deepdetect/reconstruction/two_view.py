@@ -1,7 +1,8 @@
-"""3D points from the matches of two calibrated images that need not be rectified.
+"""Triangulate 3D points from the matches of two calibrated images that are not rectified.
 
-The pose is estimated from matches at corners, refined to sub-pixel accuracy. All matches are then
-triangulated as they are. Checks in between raise an error that says why there is no depth.
+The pose is estimated from matches at corners that are refined to sub-pixel accuracy. Then all
+matches are triangulated, without refinement. Checks in between raise an error that says why the
+images give no depth.
 """
 
 from __future__ import annotations
@@ -24,37 +25,41 @@ from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners
 
 MAX_EPIPOLAR_DISTANCE_PX = 1.0
-"""A match agrees with the pose up to this Sampson distance. Chosen by hand."""
+"""A match agrees with the pose if its Sampson distance is below this. Chosen by hand."""
 
 MAX_REPROJECTION_ERROR_PX = 0.5
-"""Points are kept up to this error (root mean square of both images). Chosen by hand."""
+"""A point is kept only if its reprojection error, the root mean square of both images, is below
+this. Chosen by hand."""
 
 POSE_CELLS = 10_000
-"""The best corner of each of this many cells is refined for the pose. Chosen by hand."""
+"""The image is divided into about this number of cells, and the pose is estimated from the match at
+the best corner of each cell. Chosen by hand."""
 
 GRID_SIZE_PX = 16
-"""Each cell of the first image of this size gives one match, because neighbouring matches are not
-independent evidence. Chosen by hand."""
+"""The first image is divided into cells with this side. The checks use one match from each cell,
+because neighbouring matches are not independent evidence. Chosen by hand."""
 
 MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
-"""A pose that is compared with a fundamental matrix explains a match up to the same distance."""
+"""When a pose is compared with a fundamental matrix, it explains a match if the Sampson distance
+is below this, which is also the inlier threshold of the fundamental matrix."""
 
 MIN_POSE_RATIO = 0.75
-"""The essential matrix must explain this share of the matches that the fundamental matrix explains.
-With a correct calibration it explains as many. Chosen by hand."""
+"""A pose is accepted only if the number of matches that it explains is at least this fraction of
+the number that the fundamental matrix explains. With a correct calibration, the two numbers would
+be about equal. Chosen by hand."""
 
 MIN_IN_FRONT_FRACTION = 0.75
-"""This fraction of the inliers of a pose must lie in front of both cameras. Chosen by hand."""
+"""A pose must have this fraction of its inliers in front of both cameras. Chosen by hand."""
 
 FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
-"""These multiples of the given focal length are also tried."""
+"""These multiples of the given focal length are also tried, to check it."""
 
 MAX_FOCAL_ERROR_RATIO = 0.5
 """The given focal length is rejected if another one reduces the median error to less than this
-share. A focal length that is off by a fifth passes."""
+fraction of it. A focal length that is wrong by a fifth is still accepted."""
 
 GOOD_ERROR_PX = 0.1
-"""No other focal length is tried if the median error is smaller. Chosen by hand."""
+"""No other focal length is tried if the given one has a median error below this. Chosen by hand."""
 
 NO_DEPTH = {
     "static": "nothing moves between the images: depth needs two images from two places",
@@ -62,13 +67,13 @@ NO_DEPTH = {
     "plane": "one homography explains all the matches: the images show a plane, or the camera only "
     "rotated, and there is no depth",
 }
-"""Messages for the kinds of scenes without depth."""
+"""Error messages for the kinds of pairs that show no depth."""
 
 
 def refined_corners(
     images: tuple[np.ndarray, np.ndarray], points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matches at corners that converge to sub-pixel accuracy, for a pose."""
+    """Return the matches at corners that converge to sub-pixel accuracy, as two (K, 2) arrays."""
     pixels0 = np.rint(points0)
     rows = spread_corners(images[0], pixels0, POSE_CELLS)
     refined, converged = refine_matches(*images, pixels0[rows], points1[rows])
@@ -137,7 +142,7 @@ def checked_pose(
     seed: int,
     timer: StageTimer,
 ) -> RelativePose:
-    """Estimate the pose from refined matches, (M, 2); an error says why it cannot be estimated."""
+    """Estimate the pose from refined (M, 2) matches, or raise an error that says why it fails."""
     with timer.stage("checks"):
         cells, epipolar = check_matches(
             points0, points1, calibration.camera1.size, calibration, seed
@@ -161,10 +166,11 @@ def check_matches(
     calibration: Calibration | None = None,
     seed: int = 0,
 ) -> tuple[np.ndarray, TwoViewModel]:
-    """Raise a NoDepthError if matches (M, 2) show no overlap, no motion, or no depth.
+    """Raise a NoDepthError if (M, 2) matches show no overlap, no motion, or no depth.
 
-    Returns the (K,) rows of those that were used, one per cell, and their fundamental matrix. A
-    calibration helps to distinguish a rotating camera from a plane.
+    One match from each cell of a grid is used. Returns the (K,) indices of these matches, and the
+    fundamental matrix that is fitted to them. With a calibration, the message can distinguish a
+    rotation of the camera from a plane.
     """
     if not len(points0):
         raise NoDepthError(
@@ -191,8 +197,8 @@ def check_pose(
 ) -> RelativePose:
     """Raise a ReconstructionError if a pose explains far fewer matches than a fundamental matrix.
 
-    The calibration is then wrong. The pose is from all matches; `indices` and `epipolar` are from
-    `check_matches`.
+    The reason is then a wrong calibration. The pose was estimated from all matches; `indices` and
+    `epipolar` are the results of `check_matches`. Returns the pose.
     """
     wrong_focal = _wrong_focal(calibration)
     if pose is None:
@@ -220,9 +226,9 @@ def check_focal(
 ) -> None:
     """Raise a ReconstructionError if a very different focal length fits the matches far better.
 
-    If the camera only moved sideways, every focal length fits, and a wrong one, which stretches the
-    scene in depth, is not noticed. `errors` (M,) are Sampson distances to the pose of matches that
-    a fundamental matrix explains.
+    The (M, 2) matches are those that the fundamental matrix explains, and `errors` are their (M,)
+    Sampson distances under the pose. If the camera only moved sideways, every focal length fits. A
+    wrong one, which stretches the scene in depth, is then not noticed.
     """
     given = float(np.median(errors))
     if given < GOOD_ERROR_PX:
