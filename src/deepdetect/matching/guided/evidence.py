@@ -160,8 +160,7 @@ def is_repeated(
 def _parallax_decides(
     first: np.ndarray, scale0: float, sparse: Pair, plane: np.ndarray, copy: np.ndarray, seed: int
 ) -> bool:
-    """Return whether matches off a plane share an epipole relative to it, but not to its copy.
-    """
+    """Return whether matches off a plane share an epipole relative to it, but not to its copy."""
     points0, points1 = sparse
     on_plane = transform_points(points1, np.linalg.inv(plane))
     starts, ends = (scaled_points(points, scale0) for points in (points0, on_plane))
@@ -238,8 +237,7 @@ def compare_held_out(
 
 
 def _mean_around(values: np.ndarray) -> np.ndarray:
-    """Average a (rows, columns) grid over 3 x 3 cells without NaN; NaN itself stays NaN.
-    """
+    """Average a (rows, columns) grid over 3 x 3 cells without NaN; NaN itself stays NaN."""
     known = np.isfinite(values)
     total, count = (
         cv2.boxFilter(part, cv2.CV_64F, (3, 3), borderType=cv2.BORDER_CONSTANT)

@@ -147,8 +147,7 @@ class InitialGeometry(TwoViewModel):
         return replace(self, model="none", matrix=None, points0=nowhere, points1=nowhere)
 
     def only_below(self, max_log10_nfa: float) -> InitialGeometry:
-        """Return the geometry if its `log10_nfa` is below a limit, otherwise its `untrusted` form.
-        """
+        """Return the geometry if its `log10_nfa` is below a limit, otherwise its `untrusted` form."""
         return self if self.log10_nfa < max_log10_nfa else self.untrusted()
 
     def rescaled(self, scale0: float, scale1: float) -> InitialGeometry:
@@ -246,8 +245,7 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
 
 
 def _is_inverted(tentative: TentativeMatches, geometry: InitialGeometry) -> bool:
-    """Return whether enough inliers (`MIN_INVERTED`) are dark in one image and bright in the other.
-    """
+    """Return whether enough inliers (`MIN_INVERTED`) are dark in one image and bright in the other."""
     scale0, scale1 = tentative.scales
     agreeing = scaled_points(geometry.points0, scale0), scaled_points(geometry.points1, scale1)
     correlations = zncc_at_points(tentative.views, agreeing, WINDOW_PX)
@@ -262,8 +260,7 @@ def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatc
 
 
 def _is_clear(geometry: InitialGeometry) -> bool:
-    """Return whether enough of the matches in the coarse pass agree with the model to decide on it.
-    """
+    """Return whether enough of the matches in the coarse pass agree with the model to decide on it."""
     depth = geometry.model == "fundamental"
     least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
     most = len(geometry.points0) >= max(least, MIN_COARSE_FRACTION * len(geometry.inliers))

@@ -202,8 +202,7 @@ def _with_scene(
 def _plane_or_depth(
     grays: Pair, pixels: Pair, first: InitialGeometry, enough: float, seed: int
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match by a homography, or along epipolar lines if matches off its plane agree on an epipole.
-    """
+    """Match by a homography, or along epipolar lines if matches off its plane agree on an epipole."""
     assert first.matrix is not None
     # On a surface that is not quite flat, the homography fitted to the inliers only can be better.
     consensus = estimate_geometry(first.points0, first.points1, "homography", seed=seed).matrix
@@ -261,8 +260,7 @@ def _plane_or_depth(
 def _fit(
     points0: np.ndarray, points1: np.ndarray, model: str, gray1: np.ndarray, seed: int = 0
 ) -> TwoViewModel:
-    """Fit a model to (M, 2) matches with the guiding threshold, whether or not it can be trusted.
-    """
+    """Fit a model to (M, 2) matches with the guiding threshold, whether or not it can be trusted."""
     size1, threshold_px = gray1.shape[::-1], GUIDING_THRESHOLDS_PX[model]
     return fit_model(points0, points1, model, size1, threshold_px, seed)
 
@@ -380,8 +378,7 @@ def _match_depth(
     enough: float,
     plane: np.ndarray | None = None,
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match keypoints of a scene with depth; `plane` is the homography of a plane in it, if known.
-    """
+    """Match keypoints of a scene with depth; `plane` is the homography of a plane in it, if known."""
     if first.matrix is None:
         return first.untrusted().as_two_view_geometry(), None
     sparse = first.points0, first.points1
