@@ -315,7 +315,7 @@ def _no_matches(
 def _final_geometry(
     points: Points, model: str, seed: int, options: GeometryOptions, guide: TwoViewGeometry
 ) -> Geometry:
-    """Return the guiding geometry if it suits the caller's model and options, or else estimate one."""
+    """Return the guiding geometry if the caller's model and options allow it, or estimate one."""
     if options.homography is None and guide.matrix is not None and model in ("auto", guide.model):
         errors_of = transfer_errors if guide.model == "homography" else epipolar_errors
         errors = errors_of(*points, guide.matrix)

@@ -96,7 +96,7 @@ class Registration:
         return np.where(second[..., None], to_8_bits(self.warped), self.first)
 
     def difference(self) -> np.ndarray:
-        """Return the absolute colour difference, (H, W, 3) uint8; it is 0 outside the overlap."""
+        """Return the absolute difference of both images, (H, W, 3) uint8; 0 outside the overlap."""
         return np.where(self.valid[..., None], cv2.absdiff(self.first, to_8_bits(self.warped)), 0)
 
 

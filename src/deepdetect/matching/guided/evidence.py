@@ -40,7 +40,8 @@ from ...geometry.transforms import (
 from .tentative_matches import Pair
 
 COMPARED_SIDE_PX = 320
-"""Images are reduced to this longer side to compare shifts: periods are many pixels long."""
+"""Images are reduced to this longer side before shifts are compared. This is enough, because the
+periods of patterns are many pixels long."""
 
 MIN_SHIFT_PX = 10
 """Shifts of the reduced images below this length are ignored, because aligned images correlate at
@@ -51,8 +52,8 @@ MAX_SHIFTS = 4
 
 MIN_RELATIVE_CORRELATION = 0.4
 """A shift is tested if its correlation is above this fraction of the correlation without a shift.
-The fraction is up to 0.27 for planes of Oxford, up to 0.40 for Strecha's entry, and 0.48 or more
-for synthetic facades that repeat one window."""
+The fraction is up to 0.27 for the planar scenes of Oxford, up to 0.40 for Strecha's scene "entry",
+and 0.48 or more for synthetic facades that repeat one window."""
 
 MIN_OVERLAP = 0.6
 """A shift is tested only if the shifted images keep this fraction of the overlap, because content

@@ -1,11 +1,11 @@
 """The initial geometry of a pair from tentative matches, or the answer that none can be trusted.
 
-A coarse pass matches SIFT keypoints of small copies. It decides if the pair is clearly a plane or
-clearly has depth. Otherwise SIFT keypoints of larger copies are matched. If they give no geometry,
-or if cross-modal descriptors show that the images come from two sensors, learned descriptors
-replace SIFT. Simulated views (`asift`) are the last resort. `geometry.two_view` chooses the model.
-Its thresholds, and those in this module whose notes name no other source, were chosen on all of
-Oxford and Middlebury, Strecha's fountain and a KITTI clip.
+A coarse pass matches SIFT keypoints of small copies. Its result is used if the pair is clearly a
+plane or clearly has depth. Otherwise SIFT keypoints of larger copies are matched. If they give no
+geometry, or if cross-modal descriptors show that the images come from two sensors, learned
+descriptors replace SIFT. Simulated views (`asift`) are the last resort. `geometry.two_view` chooses
+the model. Its thresholds, and those in this module whose notes name no other source, were chosen on
+all of Oxford and Middlebury, Strecha's fountain and a KITTI clip.
 """
 
 from __future__ import annotations
@@ -51,17 +51,17 @@ COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
 Chosen on the data sets that the module names."""
 
 MIN_COARSE_INLIERS = 50
-"""The coarse pass decides if a homography has at least this many inliers, and the caller's
-keypoints decide if any model has. If SIFT on larger copies gives fewer, learned descriptors are
-tried."""
+"""The result of the coarse pass is used if a homography has at least this many inliers, and the
+result of the caller's keypoints if a model of any kind has. If SIFT on larger copies gives fewer
+inliers than this, learned descriptors are tried."""
 
 MIN_COARSE_DEPTH_INLIERS = 200
-"""The coarse pass decides on a fundamental matrix only if it has at least this many inliers. Chosen
-on the data sets that the module names."""
+"""The result of the coarse pass is used if a fundamental matrix has at least this many inliers.
+Chosen on the data sets that the module names."""
 
 MIN_COARSE_FRACTION = 0.5
-"""The coarse pass decides only if at least this fraction of its matches are also inliers. Chosen on
-the data sets that the module names."""
+"""The result of the coarse pass is used only if, in addition, at least this fraction of its matches
+are inliers. Chosen on the data sets that the module names."""
 
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
 """Longer side in pixels, and maximum number of keypoints, of the images from which oblique views
@@ -78,8 +78,8 @@ light, and up to 1.17 for two photographs."""
 
 MIN_INVERTED = 0.05
 """Images are also from two sensors if at least this fraction of the inliers has inverted
-brightness: dark in one image, bright in the other. The fraction is up to 0.04 for pairs of the
-KITTI clips with a wide baseline, because of wrong matches."""
+brightness: dark in one image, bright in the other. The fraction is up to 0.04 for wide-baseline
+pairs from the KITTI clips, because of wrong matches."""
 
 MAX_LEARNED_LOG10_NFA, MAX_CROSS_MODAL_LOG10_NFA = -10.0, -22.0
 """The log10 number of false alarms must be below the first value if only learned descriptors show a
@@ -147,7 +147,7 @@ class InitialGeometry(TwoViewModel):
         return replace(self, model="none", matrix=None, points0=nowhere, points1=nowhere)
 
     def only_below(self, max_log10_nfa: float) -> InitialGeometry:
-        """Return the geometry if its `log10_nfa` is below a limit, otherwise its `untrusted` form."""
+        """Return this geometry if its `log10_nfa` is below a limit, otherwise as `untrusted`."""
         return self if self.log10_nfa < max_log10_nfa else self.untrusted()
 
     def rescaled(self, scale0: float, scale1: float) -> InitialGeometry:
@@ -167,7 +167,7 @@ class InitialGeometry(TwoViewModel):
         )
 
     def as_two_view_geometry(self) -> TwoViewGeometry:
-        """Return the geometry in its public form."""
+        """Return the geometry as the public type `TwoViewGeometry`."""
         counts = len(self.inliers), len(self.points0)
         evidence = Evidence(*counts, float(self.log10_nfa), self.num_views)
         return TwoViewGeometry(self.model, self.matrix, evidence=evidence)
@@ -245,7 +245,7 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
 
 
 def _is_inverted(tentative: TentativeMatches, geometry: InitialGeometry) -> bool:
-    """Return whether enough inliers (`MIN_INVERTED`) are dark in one image and bright in the other."""
+    """Return whether `MIN_INVERTED` of the inliers are dark in one image, bright in the other."""
     scale0, scale1 = tentative.scales
     agreeing = scaled_points(geometry.points0, scale0), scaled_points(geometry.points1, scale1)
     correlations = zncc_at_points(tentative.views, agreeing, WINDOW_PX)
@@ -260,7 +260,7 @@ def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatc
 
 
 def _is_clear(geometry: InitialGeometry) -> bool:
-    """Return whether enough of the matches in the coarse pass agree with the model to decide on it."""
+    """Return whether enough matches of the coarse pass agree with its model to use it."""
     depth = geometry.model == "fundamental"
     least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
     most = len(geometry.points0) >= max(least, MIN_COARSE_FRACTION * len(geometry.inliers))

@@ -51,8 +51,8 @@ hand."""
 MIN_OFF_PLANE_FRACTION = 0.02
 """A scene with a plane has depth if the dense matches off the plane are at least this fraction of
 those on it. The same must hold for the sparse matches, and for the patches that do not fit the
-plane relative to those that do. The fraction is up to 0.013 for the planes of Oxford, which are not
-quite flat, and 0.032 or more for facades."""
+plane relative to those that do. The fraction is up to 0.013 for the planar scenes of Oxford, which
+are not quite flat, and 0.032 or more for facades."""
 
 MAX_MOVING_PLANES = 3
 """Maximum number of planes that are tested for a motion of their own. One is not enough, because
@@ -64,9 +64,10 @@ lines of the rest of the scene. The fraction is up to 0.3 for planes that were p
 with depth."""
 
 MIN_REST_FRACTION, MIN_REST_RATIO = 0.5, 1.05
-"""If a plane moves on its own, the rest of the scene gets a fundamental matrix of its own. This
-needs at least the first fraction of the rest's matches as inliers, and more than the second number
-times the inliers that the common matrix has among these matches. Chosen by hand."""
+"""If a plane moves on its own, the rest of the scene may get a fundamental matrix of its own. At
+least the first fraction of the rest's matches must be inliers of this matrix. The inliers must also
+be more than the second number times as many as the common matrix has among the same matches. Chosen
+by hand."""
 
 MAX_REST_LOG10_NFA = -20.0
 """The rest of a scene with a moving plane must agree on an epipole with a log10 number of false
@@ -74,8 +75,8 @@ alarms below this, relative to its own largest plane. A plane alone has -7."""
 
 MAX_PARALLAX_LOG10_NFA = -40.0
 """Sparse matches off the plane also prove depth if they agree on an epipole with a log10 number of
-false alarms below this. It is -22 or more for planes of Oxford, and -84 for Strecha's entry, which
-is nearly all wall."""
+false alarms below this. It is -22 or more for the planar scenes of Oxford, and -84 for Strecha's
+scene "entry", which is nearly all wall."""
 
 SCENE_MATCHES = 1000
 """Number of random dense matches from which the type of a scene is determined. Chosen by hand."""
@@ -94,8 +95,8 @@ further planes that move differently. Such a plane may be an overlay that stands
 the round rim of a microscope."""
 
 MIN_MATCHED_FRACTION = 0.02
-"""Dense matching has failed if it matches a smaller fraction of the keypoints. For a scene with
-depth, the sparse matches that agree with its geometry are then returned. Chosen by hand."""
+"""Dense matching has failed if it matches less than this fraction of the keypoints. For a scene
+with depth, the sparse matches that agree with its geometry are then returned. Chosen by hand."""
 
 MIN_MATCHES = 8
 """A geometry that gives fewer final matches than this is rejected. Chosen by hand."""
@@ -113,11 +114,11 @@ MAX_DISTANCE_PX = 1.0
 homography maps the keypoint of the first image. Chosen by hand."""
 
 MIN_PROPOSED_FRACTION = 0.25
-"""If the homography gives a smaller fraction of the visible keypoints a partner, the keypoints are
-sparse, and all visible keypoints are verified. Chosen by hand."""
+"""If fewer than this fraction of the visible keypoints have a partner under the homography, the
+keypoints are sparse, and all visible keypoints are verified. Chosen by hand."""
 
 MAX_VERIFIED_PIXELS = 6e6
-"""Images with more pixels are scaled down to this number for verification, which bounds memory and
+"""Images with more pixels than this are scaled down to it for verification, which bounds memory and
 time."""
 
 MAX_REFINED_SIDE_PX = 1600
@@ -173,8 +174,8 @@ def _with_scene(
 ) -> tuple[TwoViewGeometry, Pair | None]:
     """Classify the scene by the largest plane in a random sample of the dense matches.
 
-    Returns the geometry with the type of the scene, and None or, for a plane that has enough
-    matches, its matched points in the first image and its homography.
+    Returns the geometry with the type of the scene. If the plane has enough matches, also returns
+    its matched points in the first image and its homography, otherwise None.
     """
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     points0, points1 = matches.starts(xy0).astype(np.float64), matches.points1
@@ -202,7 +203,7 @@ def _with_scene(
 def _plane_or_depth(
     grays: Pair, pixels: Pair, first: InitialGeometry, enough: float, seed: int
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match by a homography, or along epipolar lines if matches off its plane agree on an epipole."""
+    """Match by a homography, or along epipolar lines if matches off its plane show depth."""
     assert first.matrix is not None
     # On a surface that is not quite flat, the homography fitted to the inliers only can be better.
     consensus = estimate_geometry(first.points0, first.points1, "homography", seed=seed).matrix
@@ -239,8 +240,8 @@ def _plane_or_depth(
             yield apart, None
         yield joint, matrix if planar else None
         if not planar and first.others:
-            # If something moves on its own, a matrix that explains a part of it is less exact for
-            # the rest. So the matches off the plane are also tried alone.
+            # If something moves on its own, a fundamental matrix that also explains a part of it is
+            # less exact for the rest. So the matches off the plane are also tried alone.
             yield guiding_geometry(grays, "fundamental", seed, first.others), None
 
     depth, geometry, matches = _first_that_matches(grays, pixels[0], ways(), enough)
@@ -260,7 +261,7 @@ def _plane_or_depth(
 def _fit(
     points0: np.ndarray, points1: np.ndarray, model: str, gray1: np.ndarray, seed: int = 0
 ) -> TwoViewModel:
-    """Fit a model to (M, 2) matches with the guiding threshold, whether or not it can be trusted."""
+    """Fit a model to (M, 2) matches with the guiding threshold, even if it cannot be trusted."""
     size1, threshold_px = gray1.shape[::-1], GUIDING_THRESHOLDS_PX[model]
     return fit_model(points0, points1, model, size1, threshold_px, seed)
 
@@ -268,10 +269,10 @@ def _fit(
 def _apart_from_plane(
     grays: Pair, first: InitialGeometry, depth: InitialGeometry, seed: int
 ) -> InitialGeometry | None:
-    """Return the geometry without a plane that moves on its own; None if no plane does.
+    """Return the geometry of the rest of the scene if a plane moves on its own, otherwise None.
 
-    `depth` is the fundamental matrix of all matches. If a plane moves on its own, this matrix fits
-    the plane or the rest, and only a part of the other.
+    `depth` is the common fundamental matrix of all matches. If a plane moves on its own, this
+    matrix fits the plane or the rest, and only a part of the other.
     """
     if first.others is None or depth.matrix is None:
         return None
@@ -378,7 +379,7 @@ def _match_depth(
     enough: float,
     plane: np.ndarray | None = None,
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match keypoints of a scene with depth; `plane` is the homography of a plane in it, if known."""
+    """Match keypoints of a scene with depth; `plane` is the homography of a known plane in it."""
     if first.matrix is None:
         return first.untrusted().as_two_view_geometry(), None
     sparse = first.points0, first.points1
@@ -427,9 +428,9 @@ def match_by_homography(
     """Match keypoints by a homography, and keep those whose patches are the same.
 
     Each keypoint of the first image is matched at most once, with the score 1 - `dissimilarity`.
-    Also returns the fraction of the compared keypoints whose patches are the same. Those that the
-    homography gives a partner are compared or, if these are few, all that it maps into the second
-    image.
+    Also returns the fraction of the compared keypoints whose patches are the same. All keypoints
+    with a partner under the homography are compared or, if these are few, all keypoints that it
+    maps into the second image.
     """
     size1 = grays[1].shape[::-1]
     predicted = transform_points(pixels[0], homography)

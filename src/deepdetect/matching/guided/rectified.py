@@ -6,10 +6,11 @@ second image.
 
 A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
 are tracked from one view to the other, starting from the matches of the rows, and the matrix is
-fitted to the tracks. If its epipolar lines then differ from the rows, or if a narrower range allows
-larger images, the images are rectified again.
+fitted to the tracks. If its epipolar lines then differ from the rows, or if the disparities turn
+out to have so narrow a range that larger images can be searched, the images are rectified again.
 
-Most constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip.
+The constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, unless their
+notes say otherwise.
 """
 
 from __future__ import annotations
@@ -59,22 +60,22 @@ sign motion towards it. If more than this fraction of the sparse matches has one
 extends only by `MARGIN_PX` into the other sign. Chosen on the data sets that the module names."""
 
 CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
-"""The two views of a match are correlated in windows with the first as side, after a blur with the
-second as sigma."""
+"""The two rectified views are blurred with the second value as sigma, and correlated in windows
+with the first value as side."""
 
 MIN_CORRELATION = 0.3
 """A match is dropped if the correlation of its windows is below this, unless `FALSE_DISCOVERY_RATE`
 allows a lower correlation."""
 
 FALSE_POSITIVE_RATE = 0.01
-"""A second minimum of the correlation is set so that chance matches at most this fraction of the
-pixels. Matches between unrelated rows show how high chance correlations are. Chosen on the data
-sets that the module names."""
+"""Besides `MIN_CORRELATION`, there is a second minimum of the correlation, set so that chance
+matches at most this fraction of the pixels. Matches between unrelated rows show how high chance
+correlations are. Chosen on the data sets that the module names."""
 
 FALSE_DISCOVERY_RATE = 0.01
-"""Matches with a correlation below the two minima are kept as well if chance explains at most this
-fraction of all kept matches. The geometry does not rely on them. Chosen on the data sets that the
-module names."""
+"""Matches with a correlation below `MIN_CORRELATION` or the minimum of `FALSE_POSITIVE_RATE` are
+kept as well if chance explains at most this fraction of all kept matches. The geometry does not
+rely on them. Chosen on the data sets that the module names."""
 
 NULL_FRACTION = 0.25
 """This fraction of the rows is matched with unrelated rows, to measure which matches chance gives.
@@ -82,8 +83,8 @@ Chosen by hand."""
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
 """The rows of tracked corners are compared with the epipolar lines of the refined matrix. The
-images are rectified again unless at least the second fraction of the corners is within the first
-distance of its line. Chosen on the data sets that the module names."""
+images are rectified again unless the second fraction of the corners, or more, lies within the first
+distance of the lines. Chosen on the data sets that the module names."""
 
 MAX_RANGE_EXCESS = 1.25
 """Scaled-down images are also rectified again if the searched range was more than this many times
@@ -106,8 +107,8 @@ MIN_TRACKS = 50
 names."""
 
 NEAR_PLANE_FRACTION = 0.8
-"""If too few corners can be tracked with the disparity range of all sparse matches, only the range
-of this fraction of them is searched: of those nearest to a known plane. Anything far in front of
+"""If too few corners can be tracked with the disparity range of all sparse matches, the range is
+reduced to that of this fraction of them, those nearest to a known plane. Anything far in front of
 the plane is then lost."""
 
 MAX_DISAGREEMENT_PX = 3.0
@@ -234,7 +235,7 @@ def rectified_view(
     if seen is not None:
         widened = min(low, seen[0]), max(high, seen[1])
         # The range from the small copy may be far off if much of the frame is empty. It is used
-        # only if it can be searched at this size.
+        # only if the images can be searched over it at this size.
         if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
             low, high = widened
     widest = frame.size[0] - 1
@@ -393,7 +394,7 @@ def _moved_to_lines(
 def _sample(
     view: RectifiedView, disparity: np.ndarray, xy0: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices of the keypoints with a disparity, their second positions, and scores."""
+    """Return the indices of keypoints that have a disparity, their partners and their scores."""
     height, width = disparity.shape
     positions = view.to_frame(xy0, 0)
     rows, column, row = view.pixels_of(positions)

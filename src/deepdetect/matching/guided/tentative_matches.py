@@ -35,7 +35,7 @@ MIN_POINTS = 1000
 many. There may be fewer, because the user chooses their number. Chosen by hand."""
 
 MAX_RATIOS = (0.85, 0.8)
-"""Limits of the ratio test, tried in this order. The second gives fewer matches but a smaller
+"""Limits of the ratio test, tried in this order. The second limit gives fewer matches but a smaller
 fraction of wrong ones, so it may show a geometry that the first does not show. Chosen by hand."""
 
 MIN_SEPARATION_PX = 2.0
@@ -175,5 +175,5 @@ def checked_positions(points: Any) -> Pair:
             "tentative matches must be two arrays of shape (K, 2): positions in both images"
         )
     if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
-        raise OptionError("tentative matches must be finite positions: leave out all others")
+        raise OptionError("tentative matches must be finite positions: leave out all other matches")
     return points0, points1

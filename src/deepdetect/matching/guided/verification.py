@@ -55,8 +55,8 @@ NULL_BLOCK_PX = 64
 """Null pairs are taken from blocks of the image with this side. Chosen by hand."""
 
 MAX_NULL_BLOCKS = 256
-"""Maximum number of random blocks for each shift. Images of up to a megapixel have no more, so all
-of their blocks are used."""
+"""Maximum number of random blocks for each shift. Images of up to a megapixel have no more blocks
+than this, so all of them are used."""
 
 MIN_POINTS_OF_MEAN = 100
 """The mean descriptor is subtracted only if it is a mean of at least this many, because a mean of
@@ -89,9 +89,9 @@ def dissimilarity(
 
     `warped` is the second image in the frame of the first, `gray0`, with content where `valid`.
     Returns (N,) float32: 1 - correlation, averaged over neighbours, divided by the bound below
-    which the fraction `FALSE_POSITIVE_RATE` of the null pairs lies. Patches match if this is below
-    1. It is infinite where there is no content, where most points around are dissimilar, and
-    everywhere if all null pairs look the same.
+    which the fraction `FALSE_POSITIVE_RATE` of the null pairs lies. Two patches match if the result
+    is below 1. It is infinite where there is no content, where most points around are dissimilar,
+    and everywhere if all null pairs look the same.
     """
     pixels = np.asarray(pixels).astype(np.int64)
     result = np.full(len(pixels), np.inf, np.float32)

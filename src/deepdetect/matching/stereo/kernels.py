@@ -1,4 +1,4 @@
-"""The compiled parts of stereo matching. Importing them needs numba; the first call compiles.
+"""The compiled parts of stereo matching. Importing them needs numba; first calls compile them.
 
 Kernels named `..._rows` process the rows `first` to `last - 1` of their arrays. The innermost axis
 of an array is the disparity, or the column, so that vector instructions process many values at
@@ -350,7 +350,7 @@ def _line_at(sums, first, last, x):  # type: ignore[no-untyped-def]
 def extrapolate_rows(  # type: ignore[no-untyped-def]
     first, last, disparity, known, carried, sign, min_support, max_difference, out
 ):
-    """Extrapolate the first known surface of each row to the left, out of the other view.
+    """Extrapolate the first known surface of each row to the left, outside the other view.
 
     `carried` holds integer disparities, which semi-global matching has carried over from the
     surfaces around. The other view shows column x at x - sign * disparity, where `sign` is 1, or -1

@@ -103,7 +103,8 @@ class DisparityOptions:
         whole = self.disparity_range
         if whole and (np.shape(whole) != (2,) or any(d % 1 for d in whole) or whole[0] > whole[1]):
             raise OptionError(
-                f"disparity_range must be the smallest and the largest disparity, not {whole}"
+                "disparity_range must be the smallest and the largest disparity in whole pixels, "
+                f"not {whole}"
             )
         check_ranges(
             self,
@@ -237,7 +238,8 @@ def compute_disparity(
     low, high = (int(disparity) for disparity in disparities)
     if max(abs(low), abs(high)) >= left.shape[1]:
         raise OptionError(
-            f"disparities {low} to {high} exceed {left.shape[1]} pixels: narrow disparity_range"
+            f"disparities {low} to {high} exceed the image width of {left.shape[1]} pixels: "
+            "narrow disparity_range"
         )
     coarse = semi_global_matching(left, right, (low, high))
     clear = coarse.uniqueness_ratio >= options.uniqueness_ratio
@@ -296,7 +298,7 @@ def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange 
 def range_with_margin(
     disparity: np.ndarray, margin_px: float, margin_fraction: float
 ) -> tuple[float, float]:
-    """Return the range of disparities without `TAIL_FRACTION`, plus a margin at both ends."""
+    """Return the range of disparities without its tails (`TAIL_FRACTION`), plus a margin."""
     low, high = np.quantile(disparity, [TAIL_FRACTION, 1 - TAIL_FRACTION])
     margin = margin_px + margin_fraction * (high - low)
     return float(low - margin), float(high + margin)

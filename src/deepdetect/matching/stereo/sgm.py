@@ -71,11 +71,11 @@ were chosen on the Motorcycle pair."""
 
 SMOOTHING_RADIUS_PX = 4
 """Radius in pixels of the window in which the disparities of one surface are averaged before each
-iteration of the fit, against the bias of the parabola."""
+iteration of the fit, to reduce the bias of the parabola."""
 
 FINAL_SMOOTHING_RADIUS_PX = 2
-"""Radius in pixels of the window in which the disparities of one surface are averaged at the
-end."""
+"""Radius in pixels of the window in which the disparities of one surface are averaged after the
+last iteration of the fit."""
 
 ITERATIONS = 2
 """Number of iterations of the fit of the grey values."""
@@ -85,8 +85,9 @@ NOISE_LEVELS = 2.0
 averaged disparity."""
 
 MIN_GAIN = 0.2
-"""Minimum factor between the grey values of the right view and those of the left, as fitted in a
-window. If it is lower, the right view shows something else, and the disparity is not refined."""
+"""Minimum of the factor by which the fit multiplies the grey values of the right view to match
+those of the left. If it is lower, the right view shows something else, and the disparity is not
+refined."""
 
 UNKNOWN = np.float32(1e9)
 """Value that stands for an unknown disparity. It is so far from any other disparity that the two

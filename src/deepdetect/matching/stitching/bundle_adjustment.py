@@ -40,7 +40,7 @@ Sizes = Mapping[int, tuple[int, int]]
 """(width, height) for each image number."""
 
 Links = list[tuple[int, int, np.ndarray, np.ndarray]]
-"""For each registered pair: the numbers of both images, and the corresponding points, (M, 2) in
+"""The registered pairs, each as the numbers of both images and the corresponding points, (M, 2) in
 each image, in units of the fit."""
 
 
@@ -234,7 +234,7 @@ def _residual_px(current: Matrices, links: Links) -> float:
 
 
 def _rotations(homographies: Matrices, focal: float) -> tuple[dict[int, np.ndarray], float]:
-    """Return the rotations nearest to homographies in units of the fit, and their squared misfit."""
+    """Return the rotations nearest to homographies in units of the fit, and the squared misfit."""
     rotations, misfit = {}, 0.0
     for number, matrix in homographies.items():
         left, stretch, right = np.linalg.svd(

@@ -33,7 +33,8 @@ MAX_DEPTH_RATIO = 5.0
 images near the horizon are stretched without bound. Chosen by hand; not measured."""
 
 MIN_WARP_SCALE = 0.67
-"""Images that are drawn at a scale below this are blurred first, because they would alias."""
+"""Images that are drawn at a scale below this are blurred first, because they would alias
+otherwise."""
 
 MIN_SHOWN_PX = 16
 """An image whose longer side is drawn with fewer pixels is blurred as if it had this many, because
@@ -191,7 +192,7 @@ def plan_curved(
     closed = len(np.unique(np.concatenate(columns))) == turn
     if closed:
         start = min(angles.values(), key=lambda angle: np.cos(angle - angles[reference]))
-    else:  # cut in the widest gap
+    else:  # the canvas is cut in the widest gap
         order = np.sort([*angles.values()])
         gaps = np.diff(np.append(order, order[0] + 2 * np.pi))
         start = float((order + gaps / 2)[gaps.argmax()])

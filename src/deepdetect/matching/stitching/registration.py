@@ -300,7 +300,7 @@ def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
 
 
 def _compose(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
-    """Compose homographies along the maximum spanning tree, to the frame of its most matched image."""
+    """Compose homographies along the maximum spanning tree, to the frame of one image."""
     tree: list[RegisteredPair] = []
     steps: list[tuple[int, int, np.ndarray]] = []
     matches = dict.fromkeys(group, 0)
