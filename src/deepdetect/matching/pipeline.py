@@ -39,9 +39,8 @@ stage of its own. All other detectors give keypoints first, and the initial geom
 third stage, from the points of a `PointDetector` if there are enough."""
 
 MAX_RETURN_ERROR_PX = 2.0
-"""A match counts as found in both directions if the reverse match that starts nearest to the end of
-this match, at most 1.5 px away in x and in y, ends at most this far from its start. Chosen by
-hand."""
+"""A match counts as found in both directions if the reverse match that starts nearest to its end,
+at most 1.5 px away in x and in y, ends at most this far from its start. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -161,13 +160,12 @@ def match_features(
 
     Returns:
         The matches, without a geometry (see `estimate_geometry`). Their scores are 1 - ratio or,
-        with "neighbours", the probabilities according to the network that the match is correct,
-        which are above 0.5.
+        with "neighbours", the network's probabilities, above 0.5, that the match is correct.
 
     Raises:
         OptionError: an option is unknown, out of its range, or incompatible with the others;
-            keypoints have no descriptors; the descriptors are of two types or lengths, or are too
-            many to fit in memory.
+            keypoints have no descriptors, descriptors of two types or lengths, or too many to fit
+            in memory.
 
     Example:
         >>> from deepdetect import PointDetector

@@ -29,8 +29,7 @@ from .pipeline import match_images
 Extent = Literal["reference", "union"]
 
 MAX_UNION = 4
-"""The frame of a union may have at most this many times the pixels of the two images together.
-Chosen by hand."""
+"""The frame of a union may have this many times the pixels of both images. Chosen by hand."""
 
 SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
@@ -63,8 +62,7 @@ class Registration:
         zncc: median local ZNCC of both images over their overlap, in [-1, 1].
         origin: (x, y) of the frame's first pixel in the first image; (0, 0) except for "union".
         applied: the images of `apply_to` warped into the frame, (H, W, C) with all their bands and
-            in their own type. Where they have no content, they are 0, or their no-data value if
-            they have one.
+            in their own type. Where they have no content, they are 0, or their no-data value.
     """
 
     homography: np.ndarray
@@ -127,8 +125,7 @@ def register(
         extent: "reference" takes the first image as the frame; "union" enlarges the frame to all
             that either image shows.
         apply_to: further images to warp by the same homography, each of the size of the second
-            image: other images of the second camera, or the file of `image1` itself, to warp all
-            its bands.
+            image: images of the same camera, or the file of `image1` itself, to warp all its bands.
         seed: seed of all random choices.
 
     Raises:

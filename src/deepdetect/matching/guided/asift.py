@@ -29,8 +29,7 @@ BLUR = 0.8
 paper."""
 
 ROUNDING = 1e-9
-"""When the size of a view is rounded up, a fraction of a pixel below this is ignored, because it is
-a rounding error."""
+"""A fraction of a pixel below this is a rounding error, and ignored when sizes are rounded up."""
 
 OUTSIDE: dict[str, Any] = {"borderValue": 128}
 
@@ -83,8 +82,7 @@ def simulate_view(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compress an image in one direction, after an anti-aliasing blur.
 
-    Returns the view, which is grey outside the image, and the (2, 3) affine map from the image to
-    the view.
+    Returns the view, grey outside the image, and the (2, 3) affine map from the image to the view.
     """
     angle = np.deg2rad(rotation_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

@@ -86,9 +86,8 @@ def _nearest_on_lines(distances, ones0, lines1, ones1, lines0, max_distance, sep
 
     For each keypoint of the first image, returns the index of its partner and three squared
     descriptor distances: to the partner, to the most similar other keypoint near the line, and to
-    the most similar keypoint far from the line. For each keypoint of the second image, returns the
-    index of its partner and the squared descriptor distance to the most similar keypoint far from
-    the line.
+    the most similar one far from the line. For each keypoint of the second image, returns the index
+    of its partner and the squared distance to the most similar keypoint far from the line.
     """
     count0, count1 = distances.shape
     partner0, partner1 = np.zeros(count0, np.int64), np.zeros(count1, np.int64)
@@ -166,6 +165,5 @@ def _poisson_tail(count: int, mean: float) -> float:
     steps = np.log(mean) - np.log(np.arange(first + 1, last + 1))
     start = first * math.log(mean) - mean - math.lgamma(first + 1)
     terms = np.exp(start + np.concatenate([[0.0], np.cumsum(steps)]))
-    # A small tail is summed directly, because it would be lost in rounding if computed as 1 minus
-    # the other terms.
+    # A small tail is summed directly, because 1 minus the other terms would lose it in rounding.
     return float(terms.sum()) if count > mean else float(max(0.0, 1 - terms[:count].sum()))

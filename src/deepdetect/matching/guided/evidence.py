@@ -44,8 +44,7 @@ COMPARED_SIDE_PX = 320
 periods of patterns are many pixels long."""
 
 MIN_SHIFT_PX = 10
-"""Shifts of the reduced images below this length are ignored, because aligned images correlate at
-any small shift."""
+"""Shifts of the reduced images below this length are ignored: images always correlate there."""
 
 MAX_SHIFTS = 4
 """Maximum number of shifts that are tested: those with the highest correlation. Chosen by hand."""
@@ -60,9 +59,8 @@ MIN_OVERLAP = 0.6
 that contradicts the shift may lie outside the overlap."""
 
 MIN_ZNCC, MIN_ZNCC_GAIN = 0.5, 0.2
-"""A homography explains a place if the ZNCC there is above the first value. It alone explains the
-place if, in addition, the ZNCC under the other homography is lower by more than the second value.
-Chosen by hand."""
+"""A homography explains a place if the ZNCC there is above the first value. It alone explains it if
+the ZNCC under the other homography is also lower by more than the second. Chosen by hand."""
 
 MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
 """A homography is preferred to its shifted copy if the places that it alone explains are at least
@@ -92,8 +90,8 @@ MIN_COMPARED = 20
 hand."""
 
 FALSE_POSITIVE_RATE = 0.05
-"""A match passes if the correlation of its window, averaged with the windows around it, is above
-that of all but this fraction of unrelated windows. Chosen by hand."""
+"""A match passes if the correlation of its window, averaged with those around it, is above that of
+all but this fraction of unrelated windows. Chosen by hand."""
 
 NEIGHBOURS = 8
 """Each sparse match is compared with this many of its nearest sparse matches. Chosen by hand."""

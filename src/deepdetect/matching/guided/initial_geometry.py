@@ -68,8 +68,7 @@ SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
 are simulated. Each view has half as many keypoints. Chosen by hand."""
 
 WINDOW_PX = 16
-"""Side in pixels of the windows around matches that are checked for inverted brightness. Chosen by
-hand."""
+"""Side of the windows around matches that are checked for inverted brightness. Chosen by hand."""
 
 MIN_GAIN = 1.2
 """Images are from two sensors if cross-modal descriptors give at least this many times the
@@ -89,20 +88,17 @@ Unrelated photographs reach -8 with learned descriptors. With cross-modal descri
 320x240 pixels reaches -20, and visible and infrared light have -24 or less."""
 
 MAX_MATCHES_TO_SEARCH = 200
-"""If a fundamental matrix has fewer inliers than this, further matches are searched along its
-epipolar lines."""
+"""Further matches are searched along the epipolar lines of a matrix with fewer inliers."""
 
 MAX_HINT_LOG10_NFA = 0.0
-"""A geometry that is not trusted may still be more than chance if its log10 number of false alarms
-is below this. Then larger copies are tried, and further matches along its epipolar lines are
-counted."""
+"""A geometry that is not trusted may be more than chance if its log10 number of false alarms is
+below this. Then larger copies are tried, and further matches along its epipolar lines counted."""
 
 
 Source = TentativeMatches | Pair | tuple[Keypoints, Keypoints] | None
 """What a geometry is estimated from: tentative matches; matches of another matcher, as (K, 2)
-positions in each image; or keypoints of both images. Keypoints are used only if each image has at
-least `MIN_POINTS` of them, with sizes and angles. Otherwise, and for None, SIFT keypoints are
-detected."""
+positions in each image; or keypoints of both images. Keypoints are used if each image has at least
+`MIN_POINTS` of them, with sizes and angles. Otherwise, and for None, SIFT keypoints are used."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

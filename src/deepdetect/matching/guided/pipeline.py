@@ -45,8 +45,7 @@ MIN_UNMATCHED_FRACTION = 0.5
 of a shifted copy of a repeated pattern lie where the pattern is already matched."""
 
 MATCHED_PX = 9
-"""Side in pixels of the window around a match in which the first image counts as matched. Chosen by
-hand."""
+"""Side of the window around a match in which the first image counts as matched. Chosen by hand."""
 
 MIN_OFF_PLANE_FRACTION = 0.02
 """A scene with a plane has depth if the dense matches off the plane are at least this fraction of
@@ -59,15 +58,13 @@ MAX_MOVING_PLANES = 3
 the first may belong to the static scene."""
 
 MIN_ON_LINES = 0.33
-"""A plane does not move on its own if at least this fraction of its matches lies on the epipolar
-lines of the rest of the scene. The fraction is up to 0.3 for planes that were pasted into scenes
-with depth."""
+"""A plane is static if at least this fraction of its matches lies on the epipolar lines of the rest
+of the scene. It is up to 0.3 for planes that were pasted into scenes with depth."""
 
 MIN_REST_FRACTION, MIN_REST_RATIO = 0.5, 1.05
 """If a plane moves on its own, the rest of the scene may get a fundamental matrix of its own. At
-least the first fraction of the rest's matches must be inliers of this matrix. The inliers must also
-be more than the second number times as many as the common matrix has among the same matches. Chosen
-by hand."""
+least the first fraction of the rest's matches must be its inliers. They must also be more than the
+second number times the inliers of the common matrix among these matches. Chosen by hand."""
 
 MAX_REST_LOG10_NFA = -20.0
 """The rest of a scene with a moving plane must agree on an epipole with a log10 number of false
@@ -118,8 +115,7 @@ MIN_PROPOSED_FRACTION = 0.25
 keypoints are sparse, and all visible keypoints are verified. Chosen by hand."""
 
 MAX_VERIFIED_PIXELS = 6e6
-"""Images with more pixels than this are scaled down to it for verification, which bounds memory and
-time."""
+"""Images with more pixels are scaled down to this number for verification: it takes less memory."""
 
 MAX_REFINED_SIDE_PX = 1600
 """Images are reduced to this longer side while the homography is refined. Chosen by hand."""
@@ -129,8 +125,7 @@ MAX_SCALE_RATIO = 1.5
 while the homography is refined, because corners of different scales lie at different places."""
 
 MIN_SCALE = 1 / 16
-"""Minimum scale to which the finer image is reduced. If the scales differ more, there is nothing to
-refine."""
+"""Minimum scale to which the finer image is reduced. Beyond it there is nothing to refine."""
 
 
 def guided_matches(
@@ -392,8 +387,7 @@ def _match_depth(
             plane = _refine_homography(grays, seen.matrix)
             dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if dense is None or len(dense[1]) < enough:
-        # The images differ around the sparse matches, but the matches themselves are distinctive
-        # and move alike.
+        # The images differ around the sparse matches, but these are distinctive and move alike.
         return _sparsely(grays[0], xy0, first)
     return _trusted(first, *dense, enough)
 

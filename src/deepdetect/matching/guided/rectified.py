@@ -1,16 +1,14 @@
 """Dense matches of a scene with depth, by rectification: epipolar lines become rows.
 
 Corresponding rows are matched (`matching.stereo`) over a range of disparities that sparse matches
-and a small copy of the pair give. Each match ends at a sub-pixel position, not at a keypoint of the
-second image.
+and a small copy of the pair give. Each match ends at a sub-pixel position, not at a keypoint.
 
 A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
 are tracked from one view to the other, starting from the matches of the rows, and the matrix is
 fitted to the tracks. If its epipolar lines then differ from the rows, or if the disparities turn
 out to have so narrow a range that larger images can be searched, the images are rectified again.
 
-The constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, unless their
-notes say otherwise.
+The constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, unless noted.
 """
 
 from __future__ import annotations
@@ -78,8 +76,7 @@ kept as well if chance explains at most this fraction of all kept matches. The g
 rely on them. Chosen on the data sets that the module names."""
 
 NULL_FRACTION = 0.25
-"""This fraction of the rows is matched with unrelated rows, to measure which matches chance gives.
-Chosen by hand."""
+"""This fraction of the rows is matched with unrelated rows, to measure chance. Chosen by hand."""
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
 """The rows of tracked corners are compared with the epipolar lines of the refined matrix. The
@@ -99,8 +96,8 @@ TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 Chosen on the data sets that the module names."""
 
 MAX_TRACK_PX = 4.0
-"""A track is wrong if it ends farther than this from the match that its row gives. Chosen on the
-data sets that the module names."""
+"""A track is wrong if it ends farther than this from the match of its row. Chosen on the data sets
+that the module names."""
 
 MIN_TRACKS = 50
 """A pair with fewer tracked corners gets no dense matches. Chosen on the data sets that the module
@@ -166,9 +163,8 @@ def match_by_rectification(
 
     The `sparse` matches, (M, 2) in both images, agree with the fundamental matrix, x1^T F x0 = 0.
     If given, the homography of a `plane` of the scene warps the second view close to the first.
-    Returns the refined matrix and the matches, which fit it exactly. Returns None if too few
-    corners can be tracked, if the sparse matches contradict the disparities, or if the pair cannot
-    be rectified.
+    Returns the refined matrix and the matches, which fit it exactly; None if too few corners can be
+    tracked, the sparse matches contradict the disparities, or the pair cannot be rectified.
     """
     sizes = (grays[0].shape[::-1], grays[1].shape[::-1])
     view = rectified_view(grays, sparse, fundamental, plane)
@@ -193,8 +189,7 @@ def match_by_rectification(
                 fundamental = _refine(fundamental, sparse, tracks[0], sizes)
     if _agreement(view, sparse) < MIN_AGREEMENT:
         return None
-    # If the rows still do not fit the refined matrix, only matches that geometry relies on are
-    # kept.
+    # If the rows still do not fit the matrix, only matches that geometry relies on are kept.
     near = row_error * view.scale < MAX_ROW_ERROR_PX
     disparity = view.disparity if near else np.where(view.relied, view.disparity, np.nan)
     rows, ends, scores = _sample(view, disparity, xy0)
@@ -370,8 +365,7 @@ def _agreement(view: RectifiedView, sparse: Pair) -> float:
     """Return the fraction of sparse matches that agree with the disparity where they start.
 
     Sparse matches that start where geometry relies on no disparity are not counted. The others are
-    independent of the rows: if most disagree, row matching has chosen the wrong one of many similar
-    places.
+    independent of the rows: if most disagree, rows were matched to similar but wrong places.
     """
     positions = [view.to_frame(points, side) for side, points in enumerate(sparse)]
     inside, column, row = view.pixels_of(positions[0])

@@ -20,8 +20,7 @@ from ...geometry.transforms import scaled_points, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 
 Pair = tuple[np.ndarray, np.ndarray]
-"""Two arrays, one per image: the images themselves, (H, W) uint8 luma, or the positions of matches,
-(M, 2) each."""
+"""Two arrays, one per image: images, (H, W) uint8 luma, or positions of matches, (M, 2) each."""
 
 MAX_SIDE_PX = 1200
 """Images with a longer side are scaled down to it, because the initial geometry may be coarse.
@@ -39,8 +38,8 @@ MAX_RATIOS = (0.85, 0.8)
 fraction of wrong ones, so it may show a geometry that the first does not show. Chosen by hand."""
 
 MIN_SEPARATION_PX = 2.0
-"""If several matches start, or end, in one square cell of this side, only one of them is kept.
-Chosen by hand."""
+"""Only one of several matches that start, or end, in one square cell of this side is kept. Chosen
+by hand."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,12 +41,10 @@ averaged. Chosen by hand."""
 
 WINDOWS_PX = (101, 31)
 """Sides of two square windows around a point, which passes if most points in each window pass. The
-smaller window is against chance matches around a small plane. It was chosen on six synthetic
-pairs."""
+smaller one is against chance matches around a small plane. It was chosen on six synthetic pairs."""
 
 MIN_SUPPORT = 0.5
-"""A point passes only if at least this fraction of the points in each window around it passes: most
-of them."""
+"""A point passes only if at least this fraction of the points in each window around it passes."""
 
 NULL_SHIFTS = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shifts between the patches of a null pair, as fractions of width and height."""

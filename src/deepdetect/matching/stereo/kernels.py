@@ -55,8 +55,7 @@ def _distances(left, right_mirrored, min_disparity, outside, out):  # type: igno
     """Write the Hamming distances between the censuses of one row of both views, (W, D) uint8."""
     width, count = out.shape
     for x in range(width):
-        # Column c = x - min_disparity - d of the right view is column width - 1 - c of the mirrored
-        # view.
+        # The right column c = x - min_disparity - d is column width - 1 - c of the mirrored view.
         start = width - 1 - x + min_disparity
         low = min(max(0, -start), count)
         high = max(min(count, width - start), low)
@@ -173,8 +172,7 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
         keys[:] = np.uint32(0xFFFFFFFF)
         for x in range(width):
             sums = total[y, x]
-            # Disparities `low` to `high - 1` lead inside the right image: 0 <= x - min_disparity -
-            # d < width.
+            # Disparities that lead inside the right image: 0 <= x - min_disparity - d < width.
             low = min(max(0, x - min_disparity - width + 1), count)
             high = max(min(count, x - min_disparity + 1), low)
             least = inside = np.uint16(65535)

@@ -27,8 +27,7 @@ from .sgm import (
 )
 
 MAX_SPECKLE_AREA_PX = 100
-"""Isolated patches of one surface are dropped if they have at most this many pixels. Chosen by
-hand."""
+"""Isolated patches of one surface with at most this many pixels are dropped. Chosen by hand."""
 
 SPECKLE_SUBDIVISIONS = 4
 """Disparities are rounded to this many steps per pixel, because OpenCV's speckle filter needs
@@ -39,8 +38,7 @@ BORDER_PX = 4
 give content just outside the image the disparity of content just inside. Chosen by hand."""
 
 OCCLUDING_EDGE_PX = 1
-"""Width in pixels of the strip along the edge of a nearer surface that is dropped if occlusions are
-filled."""
+"""Width of the edge of nearer surfaces that is dropped, in pixels, if occlusions are filled."""
 
 OCCLUSION_SLACK_PX = 8
 """A gap between two surfaces may be an occlusion if it is at most this many pixels wider than their
@@ -80,8 +78,7 @@ class DisparityOptions:
             divided by the cost of its own match, is at least this.
         discontinuity_margin_px: disparities within this distance in pixels of a disparity
             discontinuity are dropped, because windows reach that far and give pixels beside a near
-            object the disparity of the object. Objects up to twice as wide as the margin vanish. 0
-            drops no disparities.
+            object the disparity of the object. Objects up to twice as wide vanish. 0 drops nothing.
         fill_occlusions: whether pixels that the right image does not show get the disparity of the
             surface next to them. In a gap between two surfaces this is the farther surface, if the
             row and the column of the pixel give the same disparity. For pixels that lie outside the
@@ -113,8 +110,7 @@ class DisparityOptions:
 
 
 DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)
-"""Options for dense maps: disparities at discontinuities are kept, and occlusions are filled where
-that is safe."""
+"""Options for dense maps: discontinuities are kept, occlusions are filled where that is safe."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +196,7 @@ def disparity_map(
     Args:
         image0, image1: the left and the right image, of the same size, anything `load_image` takes;
             only their luma is used.
-        options: how disparities are found, and which are kept; `DENSE` keeps as many pixels as
-            possible.
+        options: how disparities are found, and which are kept; `DENSE` keeps as many as possible.
         channels: order of the colours in arrays: "rgb", or "bgr" as in OpenCV.
 
     Returns:
@@ -321,8 +316,7 @@ def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: in
     """Return which pixels are within `distance_px` of a disparity discontinuity, (H, W) bool.
 
     A window there covers two surfaces, and gives pixels beside the nearer surface the disparity of
-    that surface. Unknown pixels are taken to belong to the farther of the surfaces on both sides of
-    their row.
+    that surface. Unknown pixels count as part of the farther surface on both sides of their row.
     """
     filled = fill_occlusions(disparity, known)[0]
     beside = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -335,8 +329,7 @@ def on_occluding_edge(disparity: np.ndarray, known: np.ndarray, distance_px: int
     """Return which known pixels of nearer surfaces are within `distance_px` of a farther one.
 
     Windows also give the nearer disparity to pixels just outside the nearer surface, so these
-    pixels are the least reliable. Unknown pixels are taken to belong to the farther of the surfaces
-    on both sides of their row.
+    pixels are the least reliable. Unknown pixels count as part of the farther surface beside them.
     """
     filled = fill_occlusions(disparity, known)[0]
     farthest = cv2.erode(filled, _square(distance_px))

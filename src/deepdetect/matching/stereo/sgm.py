@@ -62,8 +62,7 @@ and a wrong match 1. Because the cost is in between, a surface that leaves the i
 from its neighbours. With a lower cost, more content at the border is lost in noisy views."""
 
 MAX_DIFFERENCE_PX = 1.0
-"""Neighbouring disparities that differ by more than this are on different surfaces. Chosen by
-hand."""
+"""Neighbouring disparities that differ by more are on different surfaces. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
 """Radius in pixels of the windows in which the grey values are fitted. It and the next five values
@@ -81,13 +80,11 @@ ITERATIONS = 2
 """Number of iterations of the fit of the grey values."""
 
 NOISE_LEVELS = 2.0
-"""Gradients below this, in grey levels per pixel, count as noise: the fit then hardly changes the
-averaged disparity."""
+"""Gradients below this, in grey levels per pixel, are noise: the averaged disparity is kept."""
 
 MIN_GAIN = 0.2
-"""Minimum of the factor by which the fit multiplies the grey values of the right view to match
-those of the left. If it is lower, the right view shows something else, and the disparity is not
-refined."""
+"""Minimum of the factor by which the fit multiplies the right view's grey values to match the left
+view. If it is lower, the right view shows something else, and the disparity is not refined."""
 
 UNKNOWN = np.float32(1e9)
 """Value that stands for an unknown disparity. It is so far from any other disparity that the two
@@ -167,8 +164,7 @@ def matching_cost(
     """Return the costs of `count` disparities for each pixel, (H, W, count) uint8.
 
     `censuses` are those of the left and the right view. A cost is a quarter of the sum of the
-    Hamming distances of 3 x 3 pixels; `outside` is the distance that is assumed outside the right
-    view.
+    Hamming distances of 3 x 3 pixels; `outside` is the distance assumed outside the right view.
     """
     from .kernels import cost_rows
 

@@ -165,8 +165,7 @@ def _in_units(
     }
     links = []
     for pair in pairs:
-        # The targets come from the homography, because it is more accurate than keypoints at
-        # integer pixels.
+        # The targets come from the homography: it is more accurate than integer keypoints.
         targets = transform_points(pair.points, pair.homography)
         points = transform_points(pair.points, to_unit[pair.first])
         targets = transform_points(targets, to_unit[pair.second])

@@ -33,8 +33,7 @@ MAX_DEPTH_RATIO = 5.0
 images near the horizon are stretched without bound. Chosen by hand; not measured."""
 
 MIN_WARP_SCALE = 0.67
-"""Images that are drawn at a scale below this are blurred first, because they would alias
-otherwise."""
+"""Images drawn at a scale below this are blurred first, because they would alias otherwise."""
 
 MIN_SHOWN_PX = 16
 """An image whose longer side is drawn with fewer pixels is blurred as if it had this many, because

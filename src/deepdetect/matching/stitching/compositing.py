@@ -1,8 +1,7 @@
 """Composite the images of a panorama on their canvas.
 
-Exposure and seams are found on small copies. Full-size images are warped one after another and
-blended in frequency bands (Burt and Adelson, "A multiresolution spline with application to image
-mosaics", 1983).
+Exposure and seams are found on small copies. Images are warped one by one and blended in frequency
+bands (Burt and Adelson, "A multiresolution spline with application to image mosaics", 1983).
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ NUM_BANDS = 5
 """Number of frequency bands; the coarsest blends over about 2^5 pixels."""
 
 SEAM_MEGAPIXELS = 0.5
-"""Exposure and seams are found on a small canvas of at most this many megapixels. Chosen by
-hand."""
+"""Exposure and seams are found on a canvas of at most this many megapixels. Chosen by hand."""
 
 MIN_OVERLAP_PX = 100
 """Two images are compared in brightness and in parallax only if they share at least this many
@@ -28,8 +26,7 @@ pixels of the small canvas. Chosen by hand."""
 
 SEAM_TOLERANCE_PX, SEAM_PERCENT = 1.0, 90.0
 """Parallax is reported if the displacements along a seam exceed the first value, in pixels of the
-small canvas, at the percentile given by the second. Smaller displacements would be invisible on a
-screen."""
+small canvas, at the percentile given by the second. Smaller ones would be invisible on a screen."""
 
 MIN_FLOW_PX = 32
 """Optical flow is computed only if both sides of an overlap have at least this many pixels. Chosen
@@ -50,8 +47,7 @@ def composite(
     `load` returns an image by its number, (H, W, 3) RGB, uint8 or uint16; it is called once per
     box. `small` holds a reduced uint8 copy of each image, and its scale. Returns the panorama
     (black outside all images, uint16 if any image is), its mask, the gain of each image, and the
-    displacement, in pixels of the panorama, for each pair of images with visible parallax along
-    their seam.
+    displacement in pixels of the panorama of pairs with visible parallax along their seam.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
@@ -93,8 +89,7 @@ class _Blender:
     ) -> None:
         """Add an image, multiplied by a factor, where its mask is 255."""
         (height, width), (x, y), step = mask.shape, corner, 1 << NUM_BANDS
-        # The box is enlarged to whole pixels of the coarsest band, and by the reach of the mask's
-        # blur.
+        # The box is enlarged to whole pixels of the coarsest band, and by the mask's blur.
         rows, columns = self.weights[0].shape
         top, left = (max(0, (start // step - 2) * step) for start in (y, x))
         bottom = min(rows, (-(-(y + height) // step) + 2) * step)
@@ -116,10 +111,7 @@ class _Blender:
             band, weight = coarse, cv2.pyrDown(weight)
 
     def blend(self) -> np.ndarray:
-        """Return the blended float32 image, padded to whole pixels of the coarsest band.
-
-        The sums are used up.
-        """
+        """Return the blended float32 image, padded to the coarsest band, and delete the sums."""
         image: np.ndarray | None = None
         while self.sums:
             band, weight = self.sums.pop(), self.weights.pop()

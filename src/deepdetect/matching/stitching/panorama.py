@@ -61,10 +61,8 @@ class Panorama:
             otherwise uint8.
         valid: (H, W) bool, true where an image is.
         homographies: (3, 3) homographies by image number, in the order in which images were
-            connected. For a flat panorama they map to `image`, for a curved one to the reference
-            image.
-        reference: number of the image that is undistorted in a flat panorama, or in the middle of a
-            curved one.
+            connected. For a flat panorama they map to `image`, otherwise to the reference image.
+        reference: number of the undistorted image, or of the middle one of a curved panorama.
         unregistered: by image number, the reason why an image is not in the panorama.
         matches: number of dense matches of each registered pair.
         residual_px: root mean square distance between the positions to which the homographies of

@@ -43,20 +43,17 @@ MIN_OVERLAP = 0.1
 keypoints into the other image. Chosen by hand; not measured."""
 
 MAX_FURTHER_TRIALS = 2
-"""Maximum number of further geometries that are tried for a pair if dense matches reject the first;
-each takes time."""
+"""Number of further geometries to try, which takes time, if dense matches reject the first."""
 
 MAX_DISAGREEMENT_PX = 2.0
 """A registered pair is registered again if the root mean square distance between its homography and
 the joint fit is larger. Chosen by hand."""
 
 MAX_CORRESPONDENCES = 400
-"""Maximum number of matches of a pair in the joint fit, evenly spread over the image. Chosen by
-hand; not measured."""
+"""Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MAX_CAMERA_RESIDUAL_PX = 3.0
-"""The root mean square residual of cameras that only rotate is at most this: 0.2 to 1 px if there
-is no parallax."""
+"""Cameras that only rotate have smaller RMS residuals: 0.2 to 1 px without parallax."""
 
 
 @dataclass(frozen=True, eq=False)
