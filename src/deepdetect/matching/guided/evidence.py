@@ -44,7 +44,7 @@ COMPARED_SIDE_PX = 320
 periods of patterns are many pixels long."""
 
 MIN_SHIFT_PX = 10
-"""Shifts of the reduced images below this length are ignored: images always correlate there."""
+"""Shifts of the reduced images below this length are ignored: aligned images correlate there."""
 
 MAX_SHIFTS = 4
 """Maximum number of shifts that are tested: those with the highest correlation. Chosen by hand."""

@@ -59,7 +59,7 @@ the first may belong to the static scene."""
 
 MIN_ON_LINES = 0.33
 """A plane is static if at least this fraction of its matches lies on the epipolar lines of the rest
-of the scene. It is up to 0.3 for planes that were pasted into scenes with depth."""
+of the scene. The fraction is up to 0.3 for planes that were pasted into scenes with depth."""
 
 MIN_REST_FRACTION, MIN_REST_RATIO = 0.5, 1.05
 """If a plane moves on its own, the rest of the scene may get a fundamental matrix of its own. At
@@ -115,7 +115,7 @@ MIN_PROPOSED_FRACTION = 0.25
 keypoints are sparse, and all visible keypoints are verified. Chosen by hand."""
 
 MAX_VERIFIED_PIXELS = 6e6
-"""Images with more pixels are scaled down to this number for verification: it takes less memory."""
+"""Images with more pixels than this are scaled down to it for verification, to save memory."""
 
 MAX_REFINED_SIDE_PX = 1600
 """Images are reduced to this longer side while the homography is refined. Chosen by hand."""
@@ -125,7 +125,8 @@ MAX_SCALE_RATIO = 1.5
 while the homography is refined, because corners of different scales lie at different places."""
 
 MIN_SCALE = 1 / 16
-"""Minimum scale to which the finer image is reduced. Beyond it there is nothing to refine."""
+"""Minimum scale to which the finer image is reduced. If scales differ more, nothing can be
+refined."""
 
 
 def guided_matches(

@@ -96,8 +96,8 @@ TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 Chosen on the data sets that the module names."""
 
 MAX_TRACK_PX = 4.0
-"""A track is wrong if it ends farther than this from the match of its row. Chosen on the data sets
-that the module names."""
+"""A track is wrong if it ends farther than this from the match that row matching gives. Chosen on
+the data sets that the module names."""
 
 MIN_TRACKS = 50
 """A pair with fewer tracked corners gets no dense matches. Chosen on the data sets that the module

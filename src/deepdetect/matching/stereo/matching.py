@@ -38,7 +38,7 @@ BORDER_PX = 4
 give content just outside the image the disparity of content just inside. Chosen by hand."""
 
 OCCLUDING_EDGE_PX = 1
-"""Width of the edge of nearer surfaces that is dropped, in pixels, if occlusions are filled."""
+"""Width in pixels of the edge of nearer surfaces that is dropped if occlusions are filled."""
 
 OCCLUSION_SLACK_PX = 8
 """A gap between two surfaces may be an occlusion if it is at most this many pixels wider than their

@@ -43,7 +43,8 @@ MIN_OVERLAP = 0.1
 keypoints into the other image. Chosen by hand; not measured."""
 
 MAX_FURTHER_TRIALS = 2
-"""Number of further geometries to try, which takes time, if dense matches reject the first."""
+"""If dense matches reject a geometry, up to this many others are tried, each of which takes
+time."""
 
 MAX_DISAGREEMENT_PX = 2.0
 """A registered pair is registered again if the root mean square distance between its homography and
