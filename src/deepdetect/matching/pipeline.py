@@ -34,11 +34,13 @@ from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
-"""A `PointDetector` skips the first stage: its points give the geometry in the third."""
+"""The stages that `match_images` reports. Only a `DeepDetect` without masks has the first as a
+stage of its own. All other detectors give keypoints first, and the initial geometry is found in the
+third stage, from the points of a `PointDetector` if there are enough."""
 
 MAX_RETURN_ERROR_PX = 2.0
-"""A match counts as found both ways if the reverse match that starts nearest to its end, up to 1.5
-px away, ends this near to its start. Chosen by hand."""
+"""A match counts as found in both directions if the reverse match that starts nearest to its end,
+at most 1.5 px away in x and in y, ends at most this far from its start. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -70,16 +72,17 @@ def match_images(
         channels: order of the colours in arrays: "rgb", or "bgr" as in OpenCV.
         selection: which pixels of a heat map become keypoints; None: those above 0.5. Not for a
             `PointDetector`.
-        ignore: a mask for each image, or None, in a tuple; or one array for both: true where no
-            keypoint is wanted.
+        ignore: a tuple with a mask or None for each image, or one mask for both images. A mask is
+            true where no keypoint is wanted.
         model: the geometry, which also guides the matching: "homography" (planes, pure rotation),
             "fundamental" (any static scene), "essential" (needs both cameras), or "auto": the one
             of the first two that fits the images.
-        mutual: keep only one-to-one matches that are found from either image, in twice the time.
-            The order of the images then does not matter.
-        tentative_matches: a few matches from another matcher (LightGlue, LoFTR, clicks), two (K, 2)
-            arrays of positions, row by row, some of which may be wrong; or the result of
-            `find_tentative_matches`. They replace our own SIFT matches for the first geometry.
+        mutual: keep only one-to-one matches that are found in both directions, which takes twice
+            the time. The order of the images then does not matter.
+        tentative_matches: a few matches of another matcher (LightGlue, LoFTR, clicks), some of
+            which may be wrong: two (K, 2) arrays of positions, where row k of one matches row k of
+            the other. Or the result of `find_tentative_matches`. The initial geometry is then
+            estimated from these matches instead of our own SIFT matches.
         seed: seed of all random choices.
         options: how the final geometry is estimated.
         progress: called with the name of each stage when it ends.
@@ -115,8 +118,8 @@ def match_images(
         cache(partial(find_keypoints, detector, image, selection, mask))
         for image, mask in zip(rgb, masks, strict=True)
     ]
-    # The network's keypoints take no part in the first geometry, and finding them cannot fail. If
-    # no geometry can be trusted, they may never be needed.
+    # The network's keypoints take no part in the initial geometry, and finding them cannot fail. So
+    # they are found last, because they are not needed if no geometry can be trusted.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     settings = guiding, model, seed, options, keypoints_last, timer
     matches = _match_guided(grays, (find[0], find[1]), source, *settings)
@@ -145,25 +148,24 @@ def match_features(
         features0, features1: keypoints with descriptors of one type.
         matcher: "flann", "exact", "patchmatch", "hamming" for binary descriptors, or "auto":
             "exact" for few keypoints, otherwise "patchmatch" for dense ones and "flann" for others.
-        filter_by: which nearest neighbours are matches: "ratio" keeps those that pass Lowe's test,
-            "neighbours" those that move, rotate and grow as the matches around them do. The latter
-            is decided by a small network and gives more correct matches and fewer wrong ones. It
-            needs at least nine mutual neighbours, learned descriptors (not cross-modal) or
+        filter_by: which nearest neighbours are matches: "ratio" keeps those that pass Lowe's ratio
+            test, "neighbours" those that move, rotate and grow as the matches around them do. A
+            small network decides on the latter; it gives more correct matches and fewer wrong ones.
+            It needs at least nine mutual neighbours, learned descriptors (not cross-modal) or
             RootSIFT, and keypoints with sizes and angles.
         ratio: upper limit of the distance to the best descriptor over that to the second-best.
-            None: 0.85, or for learned descriptors 0.88, which is equally strict.
+            None: 0.85, or 0.88 for learned descriptors, for which that is equally strict.
         mutual: keep only mutual nearest neighbours.
         seed: seed of a matcher that is random.
 
     Returns:
-        The matches, without a geometry (see `estimate_geometry`). Their scores are 1 - ratio; with
-        "neighbours" they are those of the network, above 0.5, and higher ones are more often
-        correct.
+        The matches, without a geometry (see `estimate_geometry`). Their scores are 1 - ratio or,
+        with "neighbours", the network's probabilities, above 0.5, that the match is correct.
 
     Raises:
         OptionError: an option is unknown, out of its range, or incompatible with the others;
-            keypoints have no descriptors, descriptors of two types or lengths, or too many for the
-            memory.
+            keypoints have no descriptors, descriptors of two types or lengths, or too many to fit
+            in memory.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -251,8 +253,8 @@ def _match_guided(
         guide, matched = guided_matches(grays, pixels, first, seed)
     if matched is None:
         return _no_matches(*keypoints, guide, timer)
-    # If a match ends at no keypoint of the second image, it ends where the pixel of the first one
-    # is seen.
+    # If matches do not end at keypoints of the second image, they begin at pixels of the first
+    # image and end where the second image shows these pixels.
     points = matched.starts(pixels[0]).astype(np.float32), matched.points1.astype(np.float32)
     if matched.indices1 is not None:
         points = keypoints[0].xy[matched.indices0], keypoints[1].xy[matched.indices1]
@@ -293,7 +295,7 @@ def _found_both_ways(matches: Matches, back: Matches) -> Matches:
 
 
 def check_memory(keypoints: Sequence[int]) -> None:
-    """Raise an OptionError if descriptors and their search trees would fill the memory."""
+    """Raise an OptionError if descriptors and their search trees would not fit in memory."""
     require_memory(
         f"matches of {' and '.join(f'{count:,}' for count in keypoints)} keypoints",
         "reduce them by max_keypoints, density, or a smaller resolution",
@@ -311,7 +313,7 @@ def _no_matches(
 def _final_geometry(
     points: Points, model: str, seed: int, options: GeometryOptions, guide: TwoViewGeometry
 ) -> Geometry:
-    """Return the guiding geometry if the caller asked for its model, or else estimate one."""
+    """Return the guiding geometry if the caller's model and options allow it, or estimate one."""
     if options.homography is None and guide.matrix is not None and model in ("auto", guide.model):
         errors_of = transfer_errors if guide.model == "homography" else epipolar_errors
         errors = errors_of(*points, guide.matrix)

@@ -29,7 +29,7 @@ from .pipeline import match_images
 Extent = Literal["reference", "union"]
 
 MAX_UNION = 4
-"""A union may have this many times the pixels of both images together. Chosen by hand."""
+"""The frame of a union may have this many times the pixels of both images. Chosen by hand."""
 
 SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
@@ -39,8 +39,9 @@ SHIFTS = (1 / 6, 1 / 4)
 measure how well unrelated content correlates. Chosen by hand."""
 
 MIN_DEVIATIONS = 4.0
-"""Images agree if their correlation exceeds the mean of the shifted ones by this many standard
-deviations. It was 9 to 70 for images 1 with 4 and 6 of Oxford's scenes, 1.8 between scenes."""
+"""Two images agree if their correlation exceeds the mean correlation of shifted images (`SHIFTS`)
+by this many standard deviations. The excess was 9 to 70 for image 1 with images 4 and 6 of each
+Oxford scene, and 1.8 for images of different scenes."""
 
 COMPARED_SIDE_PX = 480
 """Images are reduced to this longer side before they are compared. Chosen by hand."""
@@ -52,15 +53,16 @@ class Registration:
 
     Attributes:
         homography: (3, 3) from the first image to the second.
-        first: (H, W, 3) uint8 RGB, the first image; with the extent "union" black around it.
+        first: (H, W, 3) uint8 RGB, the first image in the frame. With the extent "union" it is
+            black outside its own area.
         warped: (H, W, 3) RGB, the second image warped into the frame, black where it has no
-            content: uint8, or uint16 if the second image has more than 8 bits.
+            content. It is uint16 if the second image has more than 8 bits, otherwise uint8.
         valid: (H, W) bool, where the warped image has content.
         matches: number of dense matches that were kept.
         zncc: median local ZNCC of both images over their overlap, in [-1, 1].
         origin: (x, y) of the frame's first pixel in the first image; (0, 0) except for "union".
-        applied: the images of `apply_to` in the same frame, (H, W, C) with all their bands, in
-            their own type, and 0 or their no-data value where they have no content.
+        applied: the images of `apply_to` warped into the frame, (H, W, C) with all their bands and
+            in their own type. Where they have no content, they are 0, or their no-data value.
     """
 
     homography: np.ndarray
@@ -81,7 +83,10 @@ class Registration:
         )
 
     def checkerboard(self) -> np.ndarray:
-        """Return a checkerboard of both images, (H, W, 3) uint8; edges continue if images fit."""
+        """Return the first and the warped image as a checkerboard, (H, W, 3) uint8.
+
+        Edges continue from square to square if the images are well registered.
+        """
         height, width = self.valid.shape
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
@@ -89,7 +94,7 @@ class Registration:
         return np.where(second[..., None], to_8_bits(self.warped), self.first)
 
     def difference(self) -> np.ndarray:
-        """Return the absolute colour difference, (H, W, 3) uint8, and 0 outside the overlap."""
+        """Return the absolute difference of both images, (H, W, 3) uint8; 0 outside the overlap."""
         return np.where(self.valid[..., None], cv2.absdiff(self.first, to_8_bits(self.warped)), 0)
 
 
@@ -116,11 +121,11 @@ def register(
     Args:
         image0, image1: anything `load_image` takes.
         detector, channels, selection, ignore, progress: see `match_images`.
-        mutual: use only matches that are found from either image, in twice the time.
-        extent: the frame: "reference" is the first image, "union" everything that either image
-            shows.
-        apply_to: further images of the second camera, or its own file for all its bands, which are
-            warped by the same homography.
+        mutual: keep only matches that are found in both directions, which takes twice the time.
+        extent: "reference" takes the first image as the frame; "union" enlarges the frame to all
+            that either image shows.
+        apply_to: further images to warp by the same homography, each of the size of the second
+            image: images of the same camera, or the file of `image1` itself, to warp all its bands.
         seed: seed of all random choices.
 
     Raises:
@@ -179,7 +184,7 @@ def register(
         bands = load_deep(each, channels, raw=True)
         if bands.shape[:2] != deep.shape[:2]:
             raise OptionError(
-                f"{file_name(each)} and the second image differ in size: leave it out"
+                f"{file_name(each)} must have the size of the second image: leave it out"
             )
         no_data = read_metadata(each).no_data if is_file(each) else None
         applied.append(warp_bands(bands, moved, size, no_data))
@@ -195,7 +200,7 @@ def _union(
     corners = outer_corners((width, height))
     back = np.linalg.inv(homography)
     ends, depths = transform_points(corners, back), corners @ back[2, :2] + back[2, 2]
-    # A pixel belongs to an image if its centre does.
+    # A pixel belongs to an image if its centre lies inside the image.
     low = np.minimum(0, np.ceil(ends.min(axis=0)))
     high = np.maximum([shape0[1], shape0[0]], np.floor(ends.max(axis=0)) + 1)
     pixels = float(np.prod(high - low))
@@ -207,7 +212,10 @@ def _union(
 
 
 def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
-    """Return whether images, (H, W) uint8 luma, are more alike under a homography than shifted."""
+    """Return whether two images, (H, W) uint8 luma, are alike once a homography aligns them.
+
+    Their correlation must clearly exceed that of shifted images, which show unrelated content.
+    """
     first, scale0 = downscale(gray0, COMPARED_SIDE_PX)
     second, scale1 = downscale(gray1, COMPARED_SIDE_PX)
     matrix = scaled_homography(homography, scale0, scale1)
@@ -217,6 +225,6 @@ def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
             length = radius * min(first.shape)
             move = translation_matrix(length * np.cos(angle), length * np.sin(angle))
             shifted.append(median_local_zncc(first, second, matrix @ move))
-    known = [value for value in shifted if value > -1]  # -1: no overlap
+    known = [value for value in shifted if value > -1]  # -1 stands for no overlap
     least = np.mean(known) + MIN_DEVIATIONS * np.std(known) if known else 1.0
     return bool(median_local_zncc(first, second, matrix) > least)

@@ -1,4 +1,4 @@
-"""Guided matching: a geometry from a few matches proposes dense ones, which are verified."""
+"""Guided matching: a geometry from a few matches proposes dense matches, which are verified."""
 
 from .initial_geometry import guiding_geometry
 from .pipeline import guided_matches

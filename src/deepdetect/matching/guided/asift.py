@@ -1,8 +1,9 @@
 """Simulated views, for pairs whose viewpoints differ too much for descriptors alone.
 
-Yu and Morel, "ASIFT: A New Framework for Fully Affine Invariant Image Comparison", 2009. Oblique
-views of one image are simulated in several directions and compared with the other image. Then the
-images change roles. The views stay upright: learned descriptors tolerate the rotations in between.
+Oblique views of one image are simulated in several directions and compared with the other image;
+then the images change roles (Yu and Morel, "ASIFT: A New Framework for Fully Affine Invariant Image
+Comparison", 2009). The views are compressed but not rotated, because learned descriptors tolerate
+rotations between views.
 """
 
 from __future__ import annotations
@@ -24,22 +25,24 @@ from ...features.learned import LEARNED
 from ...io.image import MINIMUM_SIDE
 
 BLUR = 0.8
-"""Sigma of the blur before an image is compressed, in units of sqrt(tilt^2 - 1): the paper's."""
+"""Sigma of the blur before an image is compressed, in units of sqrt(tilt^2 - 1), as in the
+paper."""
 
 ROUNDING = 1e-9
-"""A view gets no further row or column for a fraction of a pixel below this, which is rounding."""
+"""A fraction of a pixel below this is a rounding error, and ignored when sizes are rounded up."""
 
 OUTSIDE: dict[str, Any] = {"borderValue": 128}
 
 TILT, DIRECTIONS = 4.0, 8
-"""The first is the compression of a simulated view along one direction, the second the number of
-directions. Learned descriptors alone tolerate tilts of two or three. On 60 oblique pairs with tilts
-of 2 to 6 that fail without views, all showed a geometry. A tilt of 3 and five directions gave 55,
-SIFT with tilts of 2 and 4 in 30 views gave 33."""
+"""The first value is the factor by which a simulated view is compressed along one direction, the
+second the number of directions. Learned descriptors alone tolerate tilts of two or three. On 60
+oblique pairs with tilts of 2 to 6, none of which gives a geometry without simulated views, these
+values gave one for all 60. A tilt of 3 and five directions gave one for 55, and SIFT with 30 views
+at tilts of 2 and 4 for 33."""
 
 
 def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
-    """Return points with learned descriptors; none if the view is too small."""
+    """Return keypoints with learned descriptors, or no keypoints if the image is too small."""
     height, width = gray.shape
     if min(height, width) < MINIMUM_SIDE:
         return describe_learned(gray, Keypoints.empty((width, height)))
@@ -54,9 +57,9 @@ def _detector(max_keypoints: int) -> PointDetector:
 def simulated_views(
     grays: tuple[np.ndarray, np.ndarray], max_keypoints: int
 ) -> Iterator[tuple[int, Keypoints]]:
-    """Yield the described keypoints of oblique views, at their positions in the original image.
+    """Yield the image, 0 or 1, of each simulated view, and the view's keypoints and descriptors.
 
-    Each view comes with the number of its image, 0 or 1. Views of the first image come first.
+    The keypoints are at their positions in the original image. Views of the first image come first.
     """
 
     def see(side: int, rotation_deg: float) -> tuple[int, Keypoints]:
@@ -79,7 +82,7 @@ def simulate_view(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compress an image in one direction, after an anti-aliasing blur.
 
-    Returns the view, gray outside the image, and the (2, 3) affine map from the image to it.
+    Returns the view, grey outside the image, and the (2, 3) affine map from the image to the view.
     """
     angle = np.deg2rad(rotation_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -95,7 +98,10 @@ def simulate_view(
 
 
 def _fitting(gray: np.ndarray, linear: np.ndarray) -> tuple[tuple[int, int], np.ndarray]:
-    """Return the smallest size to hold the image under a linear map, and the (2, 3) affine map."""
+    """Return the smallest view that holds an image under a (2, 2) linear map.
+
+    Returns its (width, height), and the (2, 3) affine map: the linear map and a translation.
+    """
     height, width = gray.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ linear.T
     low = corners.min(0)

@@ -1,7 +1,9 @@
 """Sparse matches along known epipolar lines.
 
-A ratio test over the whole image rejects repeated structure. With a known fundamental matrix, a
-match can only lie near a line, and keypoints elsewhere show how similar wrong matches are.
+A ratio test over the whole image rejects repeated structure, because several keypoints look alike.
+With a known fundamental matrix, the partner of a keypoint must lie near its epipolar line. So the
+ratio test here compares only the keypoints near the line. Keypoints far from the line, which cannot
+be partners, show how similar wrong matches are.
 """
 
 from __future__ import annotations
@@ -15,28 +17,32 @@ from ...features.keypoints import Keypoints
 from ...geometry.transforms import translation_matrix
 
 MAX_DISTANCE_PX = 3.0
-"""The keypoints of a match lie within this distance of each other's line. Chosen by hand."""
+"""Each keypoint of a match lies within this distance of the epipolar line of the other keypoint.
+Chosen by hand."""
 
 MAX_RATIO_ELSEWHERE = 0.95
 """The descriptor distance of a match must be below this fraction of the distance to the most
-similar keypoint far from the line, which is certainly wrong. Chosen by hand."""
+similar keypoint far from the epipolar line, which is certainly wrong. Chosen by hand."""
 
 MAX_RATIO_NEAR = 0.85
-"""The ratio test among the keypoints near the line has this limit. Chosen by hand."""
+"""Maximum ratio in the ratio test among the keypoints near an epipolar line. Chosen by hand."""
 
 MIN_SEPARATION_PX = 5.0
-"""Keypoints this near to the best show the same place and are not compared. Chosen by hand."""
+"""Keypoints nearer than this to the most similar one show the same place, so the ratio test near
+the line leaves them out. Chosen by hand."""
 
 NULL_SHIFTS = (0.05, 0.1)
-"""Lines shifted by these fractions of the longer side find chance matches. Chosen by hand."""
+"""Chance matches are counted along epipolar lines shifted by these fractions of the longer side of
+the second image. Chosen by hand."""
 
 
 def epipolar_search(
     first: Keypoints, second: Keypoints, fundamental: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match keypoints with descriptors near each other's epipolar lines, mutually.
+    """Match keypoints by descriptors, only near each other's epipolar lines and one to one.
 
-    Returns (M, 2) float64 positions in both images.
+    Both keypoints of a match are each other's most similar one near the line. Returns their
+    positions, (M, 2) float64 in each image.
     """
     return _search(first, second, _squared_distances(first, second), fundamental)
 
@@ -76,12 +82,12 @@ def _search(
 
 @compiled(nogil=True)
 def _nearest_on_lines(distances, ones0, lines1, ones1, lines0, max_distance, separation):  # type: ignore[no-untyped-def]
-    """Find the most similar keypoint near the line of each keypoint, and its rivals.
+    """Find the partner of each keypoint, the most similar one near its line, and its rivals.
 
-    For each keypoint of the first image, returns the partner's index, its squared distance, that of
-    the most similar other keypoint near the line, and that of the most similar one far from it. For
-    each keypoint of the second image, returns the partner's index and the squared distance of the
-    most similar keypoint far from the line.
+    For each keypoint of the first image, returns the index of its partner and three squared
+    descriptor distances: to the partner, to the most similar other keypoint near the line, and to
+    the most similar one far from the line. For each keypoint of the second image, returns the index
+    of its partner and the squared distance to the most similar keypoint far from the line.
     """
     count0, count1 = distances.shape
     partner0, partner1 = np.zeros(count0, np.int64), np.zeros(count1, np.int64)
@@ -117,7 +123,7 @@ def _nearest_on_lines(distances, ones0, lines1, ones1, lines0, max_distance, sep
 
 
 def _points_and_lines(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return homogeneous points, and epipolar lines whose products with points are distances."""
+    """Return homogeneous points, (N, 3), and their epipolar lines, (N, 3), with unit normals."""
     homogeneous = np.column_stack([points, np.ones(len(points))])
     lines = homogeneous @ matrix.T
     length = np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-300)
@@ -127,12 +133,12 @@ def _points_and_lines(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarra
 def log10_p_value(
     first: Keypoints, second: Keypoints, fundamental: np.ndarray, used: np.ndarray
 ) -> float:
-    """Return the log10 probability that chance explains further matches along epipolar lines.
+    """Return the log10 of the probability that chance gives the further matches on epipolar lines.
 
-    `used` are the positions in the first image of all matches that the matrix was estimated from,
-    correct or wrong: they are not new evidence. The same lines, moved elsewhere, only find matches
-    by chance. The mean of their number is that of a Poisson distribution, which gives the
-    probability.
+    `used` are the positions in the first image of all matches from which the matrix was estimated,
+    correct or wrong: they are no new evidence, so only other matches are counted. Shifted copies of
+    the lines find matches only by chance. Their mean number is taken as the mean of a Poisson
+    distribution, which gives the probability of the number found along the actual lines.
     """
     distances = _squared_distances(first, second)
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}
@@ -153,11 +159,11 @@ def log10_p_value(
 
 def _poisson_tail(count: int, mean: float) -> float:
     """Return the probability that a Poisson variable is at least `count`."""
-    # The terms e^-mean mean^k / k! that are not negligible.
+    # Only the terms e^-mean mean^k / k! that are not negligible are computed.
     first = count if count > mean else 0
     last = int(max(count, mean) + 40 * math.sqrt(max(count, mean)) + 40)
     steps = np.log(mean) - np.log(np.arange(first + 1, last + 1))
     start = first * math.log(mean) - mean - math.lgamma(first + 1)
     terms = np.exp(start + np.concatenate([[0.0], np.cumsum(steps)]))
-    # A small tail is summed directly: 1 minus the other terms would round it off.
+    # A small tail is summed directly, because 1 minus the other terms would lose it in rounding.
     return float(terms.sum()) if count > mean else float(max(0.0, 1 - terms[:count].sum()))

@@ -1,15 +1,16 @@
 """Evidence for or against matches: repeated patterns, held-out windows, and neighbours.
 
-**Repeated patterns** (windows, tiles, fences). Patches look as similar one period further on, so
-they cannot tell a homography from a shifted copy. So the aligned images are correlated at all
-shifts. If one of these is nearly as good, two things decide: the places that only one of the two
-homographies explains, and sparse matches off the plane, which only agree on an epipole with the
-correct homography.
+**Repeated patterns** (windows, tiles, fences). A homography that is off by one period of a pattern
+aligns patches as well as the correct homography does. So the aligned images are correlated at all
+shifts. If one shift correlates nearly as well as no shift, two things decide between the homography
+and its shifted copy: the places that only one of the two explains, and the sparse matches off the
+plane, which agree on an epipole only relative to the correct homography.
 
-**Held-out windows.** The matches around a window predict, by an affine map, where the second image
-shows it. Correct matches predict similar content; chance matches predict unrelated content.
+**Held-out windows.** An affine map, fitted to the matches around a window, predicts where the
+second image shows the window. If these matches are correct, the content there is similar; if they
+arose by chance, it is unrelated.
 
-**Neighbours** of a correct sparse match move as it does.
+**Neighbours.** A correct sparse match moves as its neighbours do.
 """
 
 from __future__ import annotations
@@ -39,33 +40,37 @@ from ...geometry.transforms import (
 from .tentative_matches import Pair
 
 COMPARED_SIDE_PX = 320
-"""Images are reduced to this longer side to compare shifts: periods are many pixels long."""
+"""Images are reduced to this longer side before shifts are compared. This is enough, because the
+periods of patterns are many pixels long."""
 
 MIN_SHIFT_PX = 10
-"""Shorter shifts of the reduced images are ignored: aligned images correlate there anyway."""
+"""Shifts of the reduced images below this length are ignored: aligned images correlate there."""
 
 MAX_SHIFTS = 4
-"""Only the best shifts are compared, up to this number. Chosen by hand."""
+"""Maximum number of shifts that are tested: those with the highest correlation. Chosen by hand."""
 
 MIN_RELATIVE_CORRELATION = 0.4
-"""A shift is compared if it correlates at least this well, relative to no shift. Planes of Oxford
-have up to 0.27, Strecha's entry up to 0.40, synthetic facades of one window 0.48 or more."""
+"""A shift is tested if its correlation is above this fraction of the correlation without a shift.
+The fraction is up to 0.27 for the planar scenes of Oxford, up to 0.40 for Strecha's scene "entry",
+and 0.48 or more for synthetic facades that repeat one window."""
 
 MIN_OVERLAP = 0.6
-"""Shifts must keep this fraction of the overlap, because distinctive content may be hidden."""
+"""A shift is tested only if the shifted images keep this fraction of the overlap, because content
+that contradicts the shift may lie outside the overlap."""
 
 MIN_ZNCC, MIN_ZNCC_GAIN = 0.5, 0.2
-"""A homography explains a place if the ZNCC there is above the first. It explains the place alone
-if the ZNCC of the other homography is lower by the second. Chosen by hand."""
+"""A homography explains a place if the ZNCC there is above the first value. It alone explains it if
+the ZNCC under the other homography is also lower by more than the second. Chosen by hand."""
 
 MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
-"""The places that a homography explains alone must be at least the first fraction of all explained
-places, and the second number times the places that its shifted copy explains alone. Chosen by
-hand."""
+"""A homography is preferred to its shifted copy if the places that it alone explains are at least
+the first fraction of all explained places, and at least the second value times as many as those
+that the copy alone explains. Chosen by hand."""
 
 MIN_EXPLAINED_FRACTION = 0.25
-"""A homography must explain this fraction of the places of sparse matches if few places can be
-compared. Correct matches have 0.44 or more, two unrelated photographs 0."""
+"""If fewer than `MIN_COMPARED` places can be compared, a homography must explain more than this
+fraction of the places of sparse matches. It is 0.44 or more for correct matches, and 0 for those of
+two unrelated photographs."""
 
 OFF_PLANE_PX = 6.0
 """A match with a larger transfer error under the homography is off the plane. Chosen by hand."""
@@ -77,22 +82,25 @@ WINDOW_PX = 16
 """Side of the windows that divide the reduced first image, in pixels. Chosen by hand."""
 
 MIN_AROUND = 5
-"""A window is predicted if this many of its eight neighbours have matches. Chosen by hand."""
+"""The place of a window in the second image is predicted only if at least this many of the eight
+windows around it contain matches. Chosen by hand."""
 
 MIN_COMPARED = 20
-"""Fewer comparable places or windows decide nothing. Chosen by hand."""
+"""If fewer places or windows than this can be compared, the comparison decides nothing. Chosen by
+hand."""
 
 FALSE_POSITIVE_RATE = 0.05
-"""Matches pass if their window, averaged with those around it, is more similar than all but this
-fraction of unrelated windows. Chosen by hand."""
+"""A match passes if the correlation of its window, averaged with those around it, is above that of
+all but this fraction of unrelated windows. Chosen by hand."""
 
 NEIGHBOURS = 8
-"""Each sparse match is compared with this many of the nearest ones. Chosen by hand."""
+"""Each sparse match is compared with this many of its nearest sparse matches. Chosen by hand."""
 
 MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
-"""Steps between matches agree if rotation and scale differ by at most the first, relative to the
-scale. This allows for tilt and depth. The second is the error of a step in pixels. Chosen by
-hand."""
+"""The steps from a match to a neighbour, in both images, give a rotation and a scale: one complex
+number. Two of them agree if they differ by less than the first value times their magnitude, which
+allows for tilt and depth, plus the second value, the error of a step in pixels, divided by the
+length of the step. Chosen by hand."""
 
 
 def is_repeated(
@@ -103,11 +111,12 @@ def is_repeated(
     seed: int = 0,
     distinct: bool = False,
 ) -> bool:
-    """Return whether a shifted copy of a homography explains (N, 2) points as well as it does.
+    """Return whether a shifted copy of a homography explains the points as well as the original.
 
-    The points are those of dense matches or, if `distinct`, of sparse matches by the ratio test.
-    `sparse` are all tentative matches, (M, 2) in both images, many of them wrong: relative to the
-    correct homography, what lies off the plane moves towards an epipole.
+    `points0` are the (N, 2) positions in the first image of dense matches or, if `distinct`, of
+    sparse matches that passed the ratio test. `sparse` are the positions of all tentative matches,
+    (M, 2) in each image, many of them wrong. They are searched for an epipole: relative to the
+    correct homography, whatever lies off the plane moves towards an epipole or away from it.
     """
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
@@ -122,20 +131,20 @@ def is_repeated(
         step = np.linalg.inv(matrix) @ other
         middle = np.array([last / 2])
         if transfer_errors(middle, middle, step)[0] < MIN_SHIFT_PX:
-            continue  # refined back to the first homography
-        # If the pattern ends in both images, its rest may be hidden. So only what does not recur
-        # in the first image distinguishes both places.
+            continue  # the refinement undid the shift
+        # If the pattern ends in both images, its rest may be hidden. So a place where the first
+        # image shows the same content one shift away is no evidence for the homography.
         recurring = [warped_zncc(first, first, move) for move in (step, np.linalg.inv(step))]
         recurs = np.fmax(*recurring)[places] > MIN_ZNCC
-        explained = np.fmax(own, others) > MIN_ZNCC  # not for NaN in both
+        explained = np.fmax(own, others) > MIN_ZNCC  # False where both are NaN
         known = explained & np.isfinite(own) & np.isfinite(others)
         gain = (own - others)[known]
         alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
         other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
         least = max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone)
         if len(gain) < MIN_COMPARED:
-            # Distinctive descriptors suffice if most of their matches look alike and no place
-            # contradicts them.
+            # With so few places, the distinctive descriptors of sparse matches suffice if enough of
+            # their patches look alike and the copy alone explains no place.
             alike = np.mean(own > MIN_ZNCC) > MIN_EXPLAINED_FRACTION
             least = 0 if distinct and alike and not other_alone else np.inf
         if alone < least:
@@ -150,13 +159,14 @@ def is_repeated(
 def _parallax_decides(
     first: np.ndarray, scale0: float, sparse: Pair, plane: np.ndarray, copy: np.ndarray, seed: int
 ) -> bool:
-    """Return whether matches off the plane agree on an epipole with it, but not with its copy."""
+    """Return whether matches off a plane share an epipole relative to it, but not to its copy."""
     points0, points1 = sparse
     on_plane = transform_points(points1, np.linalg.inv(plane))
     starts, ends = (scaled_points(points, scale0) for points in (points0, on_plane))
     shown = ((ends > 0) & (ends < np.array(first.shape[::-1]) - 1)).all(axis=1)
     ends[~shown] = 0
-    # A match is of the pattern if the place where the plane maps its end looks like its start.
+    # A match belongs to the pattern if its start looks like the place in the first image to which
+    # the plane maps its end back.
     alike = zncc_at_points((first, first), (starts, ends), WINDOW_PX) > MIN_ZNCC
     recurs = ~shown | (alike & (np.linalg.norm(ends - starts, axis=1) > MIN_SHIFT_PX))
     errors = [transfer_errors(points0, points1, each) for each in (plane, copy)]
@@ -168,7 +178,7 @@ def _parallax_decides(
 
 
 def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the shifts (dx, dy) at which aligned images correlate nearly as well as unshifted."""
+    """Return the shifts (dx, dy), best first, at which two aligned images also correlate well."""
     size = [cv2.getOptimalDFTSize(2 * side) for side in first.shape]
 
     def correlate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -190,10 +200,12 @@ def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) ->
 def compare_held_out(
     grays: Pair, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Compare each window of the first image with where the matches around it predict it.
+    """Compare each window of the first image with its predicted place in the second image.
 
-    The matches are (M, 2) in both images. Returns the median correlation of the windows, 0 if too
-    few can be compared, and (M,) bool: False for matches whose window looks like unrelated ones.
+    The matches around a window, but not those in it, predict its place. `points0` and `points1` are
+    the (M, 2) positions of matches in each image. Returns the median correlation of the windows,
+    which is 0 if too few can be compared, and (M,) bool, which is False for matches whose window is
+    no more similar than unrelated windows.
     """
     (first, scale0), (second, scale1) = (downscale(gray, HELD_OUT_SIDE_PX) for gray in grays)
     points0, points1 = scaled_points(points0, scale0), scaled_points(points1, scale1)
@@ -224,7 +236,7 @@ def compare_held_out(
 
 
 def _mean_around(values: np.ndarray) -> np.ndarray:
-    """Average the values of windows, (rows, columns), over 3 x 3 windows; NaN stays NaN."""
+    """Average a (rows, columns) grid over 3 x 3 cells without NaN; NaN itself stays NaN."""
     known = np.isfinite(values)
     total, count = (
         cv2.boxFilter(part, cv2.CV_64F, (3, 3), borderType=cv2.BORDER_CONSTANT)
@@ -236,9 +248,11 @@ def _mean_around(values: np.ndarray) -> np.ndarray:
 def _affine_maps(
     windows: np.ndarray, points0: np.ndarray, points1: np.ndarray, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit an affine map, (3, 2), to the matches of the eight windows around each window.
+    """For each window of a grid, fit an affine map to the matches of the eight windows around it.
 
-    `windows` (M,) are the matches' windows in a grid of `shape`. Also returns where maps exist.
+    `shape` is the (rows, columns) of the grid, and `windows` holds the (M,) indices of the matches'
+    windows in the flattened grid. Returns the (rows, columns, 3, 2) maps, and a (rows, columns)
+    bool array that is true where a map exists.
     """
     size = shape[0] * shape[1]
 
@@ -261,16 +275,16 @@ def _affine_maps(
 
 
 def moving_alike(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """Return the fraction of the nearest matches that move as each of (M, 2) matches does.
+    """Return, for each of (M, 2) matches, the fraction of its nearest matches that move as it does.
 
-    Each neighbour and the match itself give a rotation and a scale. The largest group of neighbours
-    that agree with one of them is counted.
+    The steps from the match to a neighbour, in both images, give a rotation and a scale. The
+    largest group of neighbours that agree with one of them counts as moving like the match.
     """
     neighbours = min(NEIGHBOURS, len(points0) - 1)
     if neighbours < 1:
         return np.zeros(len(points0))
     first, second = points0 @ [1, 1j], points1 @ [1, 1j]
-    blocks = np.array_split(first, len(first) // 500 + 1)  # bounds the memory of the distances
+    blocks = np.array_split(first, len(first) // 500 + 1)  # in blocks, to bound the memory
     distances = (np.abs(block[:, None] - first) for block in blocks)
     nearest = np.concatenate(
         [np.argpartition(each, neighbours)[:, : neighbours + 1] for each in distances]

@@ -1,10 +1,11 @@
 """The initial geometry of a pair from tentative matches, or the answer that none can be trusted.
 
-A coarse pass on small copies comes first. It suffices if the pair is clearly a plane or clearly has
-depth. SIFT on larger copies follows. If it finds nothing, or little between images of different
-sensors, learned descriptors and simulated views (`asift`) are used. `geometry.two_view` chooses the
-model. Its thresholds, and those here if nothing else is said, were chosen on all of Oxford and
-Middlebury, Strecha's fountain and a KITTI clip.
+A coarse pass matches SIFT keypoints of small copies. Its result is used if the pair is clearly a
+plane or clearly has depth. Otherwise SIFT keypoints of larger copies are matched. If they give no
+geometry, or if cross-modal descriptors show that the images come from two sensors, learned
+descriptors replace SIFT. Simulated views (`asift`) are the last resort. `geometry.two_view` chooses
+the model. Its thresholds, and those in this module whose notes name no other source, were chosen on
+all of Oxford and Middlebury, Strecha's fountain and a KITTI clip.
 """
 
 from __future__ import annotations
@@ -42,63 +43,72 @@ from .tentative_matches import (
 )
 
 LEARNED_KEYPOINTS = 2048
-"""Number of learned keypoints, used if SIFT's keypoints show no geometry. Chosen by hand."""
+"""Maximum number of keypoints with learned descriptors, which are used if SIFT shows no geometry.
+Chosen by hand."""
 
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
-"""Longer side and keypoints of the copies for the coarse pass. Chosen on the data named above."""
+"""Longer side in pixels, and maximum number of keypoints, of the small copies in the coarse pass.
+Chosen on the data sets that the module names."""
 
 MIN_COARSE_INLIERS = 50
-"""The coarse pass, or given points, decide if this many matches agree with a homography."""
+"""The result of the coarse pass is used if a homography has at least this many inliers, and the
+result of the caller's keypoints if a model of any kind has. If SIFT on larger copies gives fewer
+inliers than this, learned descriptors are tried."""
 
 MIN_COARSE_DEPTH_INLIERS = 200
-"""Inliers of a fundamental matrix for the coarse pass to decide. Chosen on the data named above."""
+"""The result of the coarse pass is used if a fundamental matrix has at least this many inliers.
+Chosen on the data sets that the module names."""
 
 MIN_COARSE_FRACTION = 0.5
-"""Fraction of the coarse matches that must also agree. Chosen on the data named above."""
+"""The result of the coarse pass is used only if, in addition, at least this fraction of its matches
+are inliers. Chosen on the data sets that the module names."""
 
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
-"""Longer side and keypoints of images to be tilted. Views get half the keypoints. Chosen by
-hand."""
+"""Longer side in pixels, and maximum number of keypoints, of the images from which oblique views
+are simulated. Each view has half as many keypoints. Chosen by hand."""
 
 WINDOW_PX = 16
 """Side of the windows around matches that are checked for inverted brightness. Chosen by hand."""
 
 MIN_GAIN = 1.2
-"""Images are from two sensors if cross-modal descriptors give this many times the tentative matches
-of learned ones. The ratio is 1.5 to 30 for visible and infrared light, up to 1.17 for pairs of
-photographs."""
+"""Images are from two sensors if cross-modal descriptors give at least this many times the
+tentative matches that learned descriptors give. The ratio is 1.5 to 30 for visible and infrared
+light, and up to 1.17 for two photographs."""
 
 MIN_INVERTED = 0.05
-"""Images are also from two sensors if this fraction of the inliers is dark in one and bright in the
-other. Wide pairs of the KITTI clips have up to 0.04, from wrong matches."""
+"""Images are also from two sensors if at least this fraction of the inliers has inverted
+brightness: dark in one image, bright in the other. The fraction is up to 0.04 for wide-baseline
+pairs from the KITTI clips, because of wrong matches."""
 
 MAX_LEARNED_LOG10_NFA, MAX_CROSS_MODAL_LOG10_NFA = -10.0, -22.0
-"""The log10 number of false alarms must be below the first if only learned descriptors show a
-geometry, below the second if only cross-modal ones do. Networks also see the borders of images,
-which lie in the same places. Unrelated photographs reach -8 with learned descriptors. With
-cross-modal ones, noise of 320x240 pixels reaches -20, visible and infrared light -24 or less."""
+"""The log10 number of false alarms must be below the first value if only learned descriptors show a
+geometry, and below the second if only cross-modal descriptors do. Such low values are needed
+because networks also see the image borders, which lie at the same places in unrelated images.
+Unrelated photographs reach -8 with learned descriptors. With cross-modal descriptors, noise of
+320x240 pixels reaches -20, and visible and infrared light have -24 or less."""
 
 MAX_MATCHES_TO_SEARCH = 200
-"""A fundamental matrix with fewer inliers leads to a search for more along its lines."""
+"""Further matches are searched along the epipolar lines of a matrix with fewer inliers."""
 
 MAX_HINT_LOG10_NFA = 0.0
-"""If the log10 number of false alarms of the best geometry is below this, it may be more than
-chance: further matches along epipolar lines are counted."""
+"""A geometry that is not trusted may be more than chance if its log10 number of false alarms is
+below this. Then larger copies are tried, and further matches along its epipolar lines counted."""
 
 
 Source = TentativeMatches | Pair | tuple[Keypoints, Keypoints] | None
-"""What a geometry is found from: tentative matches, positions of another matcher's matches ((K, 2)
-in both images), or keypoints of both images. Given keypoints are matched only if they are enough
-points of all scales. Otherwise, and for None, SIFT keypoints are matched."""
+"""What a geometry is estimated from: tentative matches; matches of another matcher, as (K, 2)
+positions in each image; or keypoints of both images. Keypoints are used if each image has at least
+`MIN_POINTS` of them, with sizes and angles. Otherwise, and for None, SIFT keypoints are used."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InitialGeometry(TwoViewModel):
-    """A model of tentative matches, at the images' own size; "none" if none can be trusted.
+    """A geometry of tentative matches, in pixels of the full-size images.
 
-    `points0` and `points1` are its inliers, `others` the outliers, or None if the caller prescribed
-    the model. `num_views` views were simulated. Another model can be estimated from the same
-    `source`. A `learned` geometry comes from learned points, a `cross_modal` one from two sensors.
+    The model is "none" if no geometry can be trusted. `points0` and `points1` are the inliers;
+    `others` are the outliers, or None if the caller prescribed the model. `num_views` is the number
+    of simulated views. From the `source`, another model can be estimated. The geometry is `learned`
+    if it comes from learned descriptors, and `cross_modal` if it comes from images of two sensors.
     """
 
     points0: np.ndarray
@@ -113,7 +123,7 @@ class InitialGeometry(TwoViewModel):
     def of(
         cls, model: TwoViewModel, points0: np.ndarray, points1: np.ndarray, asked: str
     ) -> InitialGeometry:
-        """Return a model with its inliers and outliers; `asked` is the caller's `model`."""
+        """Split matches into inliers and outliers of a model; `asked` is the caller's `model`."""
         agreeing, rest = model.inliers, ~model.inliers
         others = (points0[rest], points1[rest]) if asked == "auto" else None
         return cls(
@@ -122,22 +132,22 @@ class InitialGeometry(TwoViewModel):
 
     @property
     def all_points(self) -> Pair:
-        """Positions of all matches, inliers first."""
+        """Positions of all matches in both images, inliers first."""
         assert self.others is not None
         points0, points1 = self.others
         return np.concatenate([self.points0, points0]), np.concatenate([self.points1, points1])
 
     def untrusted(self) -> InitialGeometry:
-        """Return a geometry that cannot be trusted, with the same number of false alarms."""
+        """Return this geometry as the model "none", without its matrix and its inliers."""
         nowhere = np.empty((0, 2))
         return replace(self, model="none", matrix=None, points0=nowhere, points1=nowhere)
 
     def only_below(self, max_log10_nfa: float) -> InitialGeometry:
-        """Return the geometry itself if it can be trusted, otherwise an untrusted one."""
+        """Return this geometry if its `log10_nfa` is below a limit, otherwise as `untrusted`."""
         return self if self.log10_nfa < max_log10_nfa else self.untrusted()
 
     def rescaled(self, scale0: float, scale1: float) -> InitialGeometry:
-        """Convert the geometry of scaled images to that of the images themselves."""
+        """Convert the geometry of images scaled by these factors to the images at full size."""
         assert self.matrix is not None
         convert = scaled_homography if self.model == "homography" else scaled_fundamental
         return replace(
@@ -153,7 +163,7 @@ class InitialGeometry(TwoViewModel):
         )
 
     def as_two_view_geometry(self) -> TwoViewGeometry:
-        """Return the geometry in its public form."""
+        """Return the geometry as the public type `TwoViewGeometry`."""
         counts = len(self.inliers), len(self.points0)
         evidence = Evidence(*counts, float(self.log10_nfa), self.num_views)
         return TwoViewGeometry(self.model, self.matrix, evidence=evidence)
@@ -211,11 +221,11 @@ def _geometry_of_keypoints(
 
 
 def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
-    """Find the geometry from points with learned descriptors, also between different sensors.
+    """Find the geometry from keypoints with learned descriptors, or cross-modal ones if needed.
 
-    In different light, in the dark, under blur or from another side, these points have two to
+    In different light, in the dark, under blur or from another side, these keypoints have two to
     fifteen times as many inliers as SIFT's keypoints. SIFT has more if one image is four times as
-    large. SIFT's positions are more exact, which helps to tell depth from a plane.
+    large as the other. SIFT's positions are more exact, which helps to tell depth from a plane.
     """
     as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
     seen = as_it_is.views, as_it_is.features
@@ -231,7 +241,7 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
 
 
 def _is_inverted(tentative: TentativeMatches, geometry: InitialGeometry) -> bool:
-    """Return whether some inliers are dark in one image and bright in the other."""
+    """Return whether `MIN_INVERTED` of the inliers are dark in one image, bright in the other."""
     scale0, scale1 = tentative.scales
     agreeing = scaled_points(geometry.points0, scale0), scaled_points(geometry.points1, scale1)
     correlations = zncc_at_points(tentative.views, agreeing, WINDOW_PX)
@@ -246,7 +256,7 @@ def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatc
 
 
 def _is_clear(geometry: InitialGeometry) -> bool:
-    """Return whether enough matches of the coarse pass, and most of them, agree with the model."""
+    """Return whether enough matches of the coarse pass agree with its model to use it."""
     depth = geometry.model == "fundamental"
     least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
     most = len(geometry.points0) >= max(least, MIN_COARSE_FRACTION * len(geometry.inliers))
@@ -255,7 +265,7 @@ def _is_clear(geometry: InitialGeometry) -> bool:
 
 def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> InitialGeometry:
     """Estimate the geometry from sparse matches of another matcher, some of them wrong."""
-    # The thresholds were chosen for images of this size.
+    # Positions are scaled down to images of this side, for which the thresholds were chosen.
     scale0, scale1 = (min(1.0, MAX_SIDE_PX / max(gray.shape)) for gray in grays)
     size0, size1 = (
         (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
@@ -275,10 +285,10 @@ def estimate_initial_geometry(
     semi_calibrated: bool = True,
     view_keypoints: int = 0,
 ) -> InitialGeometry:
-    """Estimate the geometry of a pair from its tentative matches and those of simulated views.
+    """Estimate the geometry of a pair from tentative matches and those of simulated views.
 
-    Each view has `view_keypoints` keypoints; 0 simulates no views. For the other arguments see
-    `choose_model`.
+    Each simulated view has `view_keypoints` keypoints; if this is 0, no views are simulated. For
+    the other arguments see `choose_model`.
     """
     sizes = tentative.views[0].shape[::-1], tentative.views[1].shape[::-1]
     nowhere = np.empty((0, 2))
@@ -305,7 +315,7 @@ def estimate_initial_geometry(
 def _matches_of_views(
     tentative: TentativeMatches, view_keypoints: int
 ) -> tuple[Pair, np.ndarray, int]:
-    """Return all matches with those of simulated views: positions, ratios, number of views."""
+    """Return the matches, those of simulated views included: positions, ratios, number of views."""
     found = [(*tentative.matched, tentative.ratios)]
     for side, seen in simulated_views(tentative.views, view_keypoints):
         further = match_sparse(seen, tentative.features[1 - side])
@@ -317,7 +327,7 @@ def _matches_of_views(
 def _with_further_evidence(
     geometry: InitialGeometry, used: np.ndarray, tentative: TentativeMatches
 ) -> InitialGeometry:
-    """Let keypoints that are not yet matched decide if a fundamental matrix is in doubt."""
+    """If a fundamental matrix is in doubt, let keypoints that are not yet matched decide."""
     doubtful = not geometry.trusted and geometry.log10_nfa < MAX_HINT_LOG10_NFA
     if geometry.model != "fundamental" or not doubtful:
         return geometry
@@ -329,7 +339,7 @@ def _with_further_evidence(
 def _with_further_matches(
     geometry: InitialGeometry, tentative: TentativeMatches
 ) -> InitialGeometry:
-    """Search along the lines of a fundamental matrix that has few inliers, and refit it."""
+    """If a fundamental matrix has few inliers, search for more along its lines, and refit it."""
     if geometry.model != "fundamental" or len(geometry.points0) >= MAX_MATCHES_TO_SEARCH:
         return geometry
     assert geometry.matrix is not None

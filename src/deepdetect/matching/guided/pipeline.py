@@ -1,7 +1,8 @@
 """Guided matching: an initial geometry is refined and predicts the partner of every keypoint.
 
-The geometry only proposes matches. A match is kept if both patches are the same once the geometry
-is removed (`verification`), or if it is the best on its row in both images (`rectified`).
+The geometry only proposes matches. A match by a homography is kept if both patches look the same
+once the images are aligned (`verification`). A match by a fundamental matrix is kept if each pixel
+is the best for the other on their common row of the rectified images (`rectified`).
 """
 
 from __future__ import annotations
@@ -36,93 +37,105 @@ from .tentative_matches import Pair
 from .verification import dissimilarity
 
 MIN_VERIFIED_FRACTION = 0.5
-"""A homography is the plane of the scene if this fraction of the matches that it proposes is
+"""The scene counts as planar if at least this fraction of the matches that a homography proposes is
 verified. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_UNMATCHED_FRACTION = 0.5
-"""This fraction of a further plane's matches must be new, unlike those of a shifted pattern."""
+"""This fraction or more of a further plane's matches must lie where nothing is matched yet. Those
+of a shifted copy of a repeated pattern lie where the pattern is already matched."""
 
 MATCHED_PX = 9
 """Side of the window around a match in which the first image counts as matched. Chosen by hand."""
 
 MIN_OFF_PLANE_FRACTION = 0.02
-"""A scene has depth if the dense matches off the plane are at least this fraction of those on it,
-and the sparse matches likewise. Their patches must not fit the plane. The planes of Oxford, which
-are not quite flat, have up to 0.013, facades 0.032 or more."""
+"""A scene with a plane has depth if the dense matches off the plane are at least this fraction of
+those on it. The same must hold for the sparse matches, and for the patches that do not fit the
+plane relative to those that do. The fraction is up to 0.013 for the planar scenes of Oxford, which
+are not quite flat, and 0.032 or more for facades."""
 
 MAX_MOVING_PLANES = 3
-"""Number of planes tested for independent motion, as the first may belong to the static scene."""
+"""Maximum number of planes that are tested for a motion of their own. One is not enough, because
+the first may belong to the static scene."""
 
 MIN_ON_LINES = 0.33
-"""A plane is static if this fraction of its matches lies on the epipolar lines of the rest. Planes
-that were pasted into scenes with depth have up to 0.3."""
+"""A plane is static if at least this fraction of its matches lies on the epipolar lines of the rest
+of the scene. The fraction is up to 0.3 for planes that were pasted into scenes with depth."""
 
 MIN_REST_FRACTION, MIN_REST_RATIO = 0.5, 1.05
-"""The rest of a scene with a moving plane gets its own matrix if the first fraction of its matches
-are inliers, and the second number times as many as for the common matrix. Chosen by hand."""
+"""If a plane moves on its own, the rest of the scene may get a fundamental matrix of its own. At
+least the first fraction of the rest's matches must be its inliers. They must also be more than the
+second number times the inliers of the common matrix among these matches. Chosen by hand."""
 
 MAX_REST_LOG10_NFA = -20.0
-"""The rest must agree on an epipole with a smaller log10 number of false alarms. A plane has -7."""
+"""The rest of a scene with a moving plane must agree on an epipole with a log10 number of false
+alarms below this, relative to its own largest plane. A plane alone has -7."""
 
 MAX_PARALLAX_LOG10_NFA = -40.0
-"""Sparse matches off the plane also prove depth if they agree on an epipole this clearly. Planes of
-Oxford have -22 or more; Strecha's entry, which is nearly all wall, has -84."""
+"""Sparse matches off the plane also prove depth if they agree on an epipole with a log10 number of
+false alarms below this. It is -22 or more for the planar scenes of Oxford, and -84 for Strecha's
+scene "entry", which is nearly all wall."""
 
 SCENE_MATCHES = 1000
-"""Number of random dense matches that the type of a scene is judged by. Chosen by hand."""
+"""Number of random dense matches from which the type of a scene is determined. Chosen by hand."""
 
 DOMINANT_FRACTION, MIN_PLANE_FRACTION = 0.5, 0.2
-"""A plane is dominant if it has the first fraction of these matches. It is tested for repeated
-patterns if it has the second. Chosen by hand."""
+"""A plane is dominant if at least the first fraction of the `SCENE_MATCHES` lies on it. It is
+tested for repeated patterns if at least the second fraction does. Chosen by hand."""
 
 MAX_CLEAR_LOG10_NFA, MIN_CLEAR_CORRELATION = -12.0, 0.5
-"""Confidence is "high" if the log10 number of false alarms is below the first and the correlation
-of held-out windows above the second. Chosen by hand."""
+"""The confidence is "high" only if the log10 number of false alarms is below the first value, and
+the correlation of held-out windows above the second. Chosen by hand."""
 
 MIN_OWN_FRACTION = 0.67
-"""High confidence also needs this fraction of the matches to agree with the geometry. What moves
-differently may be an overlay that stands still, such as the round rim of a microscope."""
+"""High confidence also needs at least this fraction of all matches to follow the geometry, not
+further planes that move differently. Such a plane may be an overlay that stands still, for example
+the round rim of a microscope."""
 
 MIN_MATCHED_FRACTION = 0.02
-"""If a smaller fraction of the keypoints of a scene with depth is matched, the result is the sparse
-matches that agree with its geometry. Chosen by hand."""
+"""Dense matching has failed if it matches less than this fraction of the keypoints. For a scene
+with depth, the sparse matches that agree with its geometry are then returned. Chosen by hand."""
 
 MIN_MATCHES = 8
-"""A geometry with fewer matches is rejected after all. Chosen by hand."""
+"""A geometry that gives fewer final matches than this is rejected. Chosen by hand."""
 
 MIN_MOVING_ALIKE = 0.6
-"""A sparse match is verified if this fraction of its neighbours moves alike. Chosen by hand."""
+"""A sparse match is verified if at least this fraction of its nearest matches moves as it does.
+Chosen by hand."""
 
 MIN_ALIKE_FRACTION = 0.3
-"""This fraction of the sparse matches must be verified: at random places up to a tenth is."""
+"""Sparse matches are returned only if at least this fraction of them is verified. At random places,
+up to a tenth of the matches is verified."""
 
 MAX_DISTANCE_PX = 1.0
-"""A match lies this near to where the homography maps the keypoint. Chosen by hand."""
+"""A keypoint of the second image may be a partner if it is nearer than this to the place where the
+homography maps the keypoint of the first image. Chosen by hand."""
 
 MIN_PROPOSED_FRACTION = 0.25
-"""If a smaller fraction of the visible keypoints has a partner under the homography, keypoints are
-few and all of them are verified. Chosen by hand."""
+"""If fewer than this fraction of the visible keypoints have a partner under the homography, the
+keypoints are sparse, and all visible keypoints are verified. Chosen by hand."""
 
 MAX_VERIFIED_PIXELS = 6e6
-"""Larger images are scaled down to this for verification, which bounds memory and time."""
+"""Images with more pixels than this are scaled down to it for verification, to save memory."""
 
 MAX_REFINED_SIDE_PX = 1600
 """Images are reduced to this longer side while the homography is refined. Chosen by hand."""
 
 MAX_SCALE_RATIO = 1.5
-"""If the scale of both images differs by more than this, the finer one is scaled down for the
-refinement: corners of different scales lie at different places."""
+"""If the scales of the two images differ by more than this factor, the finer image is scaled down
+while the homography is refined, because corners of different scales lie at different places."""
 
 MIN_SCALE = 1 / 16
-"""An image is not scaled down below this: at larger differences there is nothing to refine."""
+"""Minimum scale to which the finer image is reduced. If scales differ more, nothing can be
+refined."""
 
 
 def guided_matches(
     grays: Pair, pixels: Pair, first: InitialGeometry, seed: int = 0
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match keypoints on whole pixels, (N, 2) and (M, 2), of two images by their `first` geometry.
+    """Match keypoints on integer pixels, (N, 2) and (M, 2), guided by a `first` geometry.
 
-    Returns the geometry that guided, and the matches; None if no geometry can be trusted.
+    Returns the geometry that guided the dense matching, and the matches, which are None if no
+    geometry can be trusted.
     """
     enough = MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels)
     if first.cross_modal:
@@ -155,9 +168,10 @@ def guided_matches(
 def _with_scene(
     grays: Pair, xy0: np.ndarray, geometry: TwoViewGeometry, matches: GuidedMatches, seed: int
 ) -> tuple[TwoViewGeometry, Pair | None]:
-    """Classify the scene by the homography that most of a sample of the dense matches agree with.
+    """Classify the scene by the largest plane in a random sample of the dense matches.
 
-    Also returns the matched points of the first image on its plane, and the homography.
+    Returns the geometry with the type of the scene. If the plane has enough matches, also returns
+    its matched points in the first image and its homography, otherwise None.
     """
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     points0, points1 = matches.starts(xy0).astype(np.float64), matches.points1
@@ -185,9 +199,9 @@ def _with_scene(
 def _plane_or_depth(
     grays: Pair, pixels: Pair, first: InitialGeometry, enough: float, seed: int
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match by the homography, or by epipolar lines if matches off its plane agree on them."""
+    """Match by a homography, or along epipolar lines if matches off its plane show depth."""
     assert first.matrix is not None
-    # On a surface that is not quite flat, the plain consensus can be the better plane.
+    # On a surface that is not quite flat, the homography fitted to the inliers only can be better.
     consensus = estimate_geometry(first.points0, first.points1, "homography", seed=seed).matrix
     refined = _refine_homography(grays, first.matrix)
     known = [refined, first.matrix, *([] if consensus is None else [consensus])]
@@ -200,7 +214,7 @@ def _plane_or_depth(
     evidence = replace(plane[0].evidence, verified=verified)
     plane = replace(plane[0], evidence=evidence), plane[1]
     if first.cross_modal:
-        # Patches of different sensors that differ are no evidence of depth.
+        # If the patches of images of two sensors differ, this is no evidence of depth.
         if plane[1] is None:
             plane = _sparsely(grays[0], pixels[0], first)
         if plane[1] is not None:
@@ -222,7 +236,8 @@ def _plane_or_depth(
             yield apart, None
         yield joint, matrix if planar else None
         if not planar and first.others:
-            # Independent motion can spoil a matrix that also explains a part of it.
+            # If something moves on its own, a fundamental matrix that also explains a part of it is
+            # less exact for the rest. So the matches off the plane are also tried alone.
             yield guiding_geometry(grays, "fundamental", seed, first.others), None
 
     depth, geometry, matches = _first_that_matches(grays, pixels[0], ways(), enough)
@@ -242,7 +257,7 @@ def _plane_or_depth(
 def _fit(
     points0: np.ndarray, points1: np.ndarray, model: str, gray1: np.ndarray, seed: int = 0
 ) -> TwoViewModel:
-    """Fit a model to (M, 2) matches with the guiding thresholds, trusted or not."""
+    """Fit a model to (M, 2) matches with the guiding threshold, even if it cannot be trusted."""
     size1, threshold_px = gray1.shape[::-1], GUIDING_THRESHOLDS_PX[model]
     return fit_model(points0, points1, model, size1, threshold_px, seed)
 
@@ -250,9 +265,10 @@ def _fit(
 def _apart_from_plane(
     grays: Pair, first: InitialGeometry, depth: InitialGeometry, seed: int
 ) -> InitialGeometry | None:
-    """Return the geometry of everything except a plane that moves on its own; None if none does.
+    """Return the geometry of the rest of the scene if a plane moves on its own, otherwise None.
 
-    The common fundamental matrix `depth` would fit one of the two and cut through the other.
+    `depth` is the common fundamental matrix of all matches. If a plane moves on its own, this
+    matrix fits the plane or the rest, and only a part of the other.
     """
     if first.others is None or depth.matrix is None:
         return None
@@ -277,7 +293,8 @@ def _apart_from_plane(
         errors = epipolar_errors(points0[on], points1[on], rest.matrix)
         if np.mean(errors < GUIDING_THRESHOLDS_PX["homography"]) >= MIN_ON_LINES:
             continue
-        # A plane fits many fundamental matrices: evidence of depth is also off the rest's plane.
+        # A plane fits many fundamental matrices. So the rest has depth only if it consists of more
+        # than a plane: its matches off its largest plane must agree on an epipole.
         rest0, rest1 = points0[~on][rest.inliers], points1[~on][rest.inliers]
         another = _fit(rest0, rest1, "homography", grays[1], seed)
         if another.matrix is None or (
@@ -297,7 +314,7 @@ def _with_further_planes(
     enough: float,
     seed: int,
 ) -> GuidedMatches:
-    """Add the matches of planes that move differently, by sparse matches left unexplained."""
+    """Add dense matches of planes that move differently, found from unexplained sparse matches."""
     if first.others is None or matches.points0 is not None:
         return matches
     assert geometry.matrix is not None
@@ -334,9 +351,10 @@ def _first_that_matches(
     ways: Iterable[tuple[InitialGeometry, np.ndarray | None]],
     enough: float,
 ) -> tuple[InitialGeometry, TwoViewGeometry, GuidedMatches | None]:
-    """Match by geometries, each with its plane if known, until one gives enough matches.
+    """Match by one initial geometry after another, until one gives enough matches.
 
-    Returns the geometry with most matches, the first of equal ones, with its result.
+    Each of the `ways` is a geometry with the homography of a plane, or with None. Returns the
+    geometry that gives most matches, or the first of several with equally many, and its result.
     """
     best, most = None, -1
     for first, plane in ways:
@@ -357,19 +375,20 @@ def _match_depth(
     enough: float,
     plane: np.ndarray | None = None,
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match keypoints of a scene with depth; `plane` is a known homography."""
+    """Match keypoints of a scene with depth; `plane` is the homography of a known plane in it."""
     if first.matrix is None:
         return first.untrusted().as_two_view_geometry(), None
     sparse = first.points0, first.points1
     dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if plane is None and (dense is None or len(dense[1]) < enough):
-        # Wide pairs can be rectified if they mostly show a plane.
+        # Pairs with a wide baseline can be rectified if they mostly show a plane, whose homography
+        # makes the views similar.
         seen = _fit(*sparse, "homography", grays[1])
         if seen.matrix is not None and seen.trusted:
             plane = _refine_homography(grays, seen.matrix)
             dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if dense is None or len(dense[1]) < enough:
-        # The surroundings of the sparse matches differ, but they are distinctive and agree.
+        # The images differ around the sparse matches, but these are distinctive and move alike.
         return _sparsely(grays[0], xy0, first)
     return _trusted(first, *dense, enough)
 
@@ -404,8 +423,9 @@ def match_by_homography(
     """Match keypoints by a homography, and keep those whose patches are the same.
 
     Each keypoint of the first image is matched at most once, with the score 1 - `dissimilarity`.
-    Also returns the fraction with the same patches: of the pairs that the homography proposes, or,
-    if keypoints are few, of all keypoints that the second image shows under it.
+    Also returns the fraction of the compared keypoints whose patches are the same. All keypoints
+    with a partner under the homography are compared or, if these are few, all keypoints that it
+    maps into the second image.
     """
     size1 = grays[1].shape[::-1]
     predicted = transform_points(pixels[0], homography)
@@ -415,7 +435,7 @@ def match_by_homography(
     near = distances < MAX_DISTANCE_PX
     indices0 = np.flatnonzero(shown.all(axis=1))
     proposed = np.flatnonzero(near)
-    # If keypoints are few, it is chance which of them have a partner: all are verified.
+    # If keypoints are sparse, it is chance which of them have a partner, so all are verified.
     if len(proposed) >= MIN_PROPOSED_FRACTION * len(indices0):
         indices0 = proposed
     ratios = _compare(grays, pixels[0][indices0], homography, seed)
@@ -454,10 +474,10 @@ def _refine_homography(grays: Pair, homography: np.ndarray) -> np.ndarray:
 
 
 def _scales_at_centre(homography: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
-    """Return the scales of both images at which the finer one is as coarse as the other.
+    """Return the factors by which to scale the images so that both show equally fine detail.
 
-    An image is finer if its scale is larger in every direction, by more than `MAX_SCALE_RATIO`, at
-    the centre of the first image.
+    An image is scaled down if it is finer: its scale is larger than that of the other image in
+    every direction, by a factor of more than `MAX_SCALE_RATIO`, at the centre of the first image.
     """
     centre = np.array([shape[1] / 2, shape[0] / 2])
     around = transform_points(centre + [[0, 0], [1, 0], [0, 1]], homography)

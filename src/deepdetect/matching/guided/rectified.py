@@ -1,11 +1,14 @@
 """Dense matches of a scene with depth, by rectification: epipolar lines become rows.
 
-Rows are matched (`matching.stereo`) in the range that sparse matches and small copies give. The
-matches end at sub-pixel positions, not at keypoints of the second image. A fundamental matrix from
-few matches may be off by some pixels far from them. So corners are tracked around their matches,
-and the matrix is fitted to them. If its lines are then far from the rows, or larger images can be
-searched, the images are rectified again. The constants were chosen on Oxford, Middlebury, Strecha's
-fountain and a KITTI clip.
+Corresponding rows are matched (`matching.stereo`) over a range of disparities that sparse matches
+and a small copy of the pair give. Each match ends at a sub-pixel position, not at a keypoint.
+
+A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
+are tracked from one view to the other, starting from the matches of the rows, and the matrix is
+fitted to the tracks. If its epipolar lines then differ from the rows, or if the disparities turn
+out to have so narrow a range that larger images can be searched, the images are rectified again.
+
+The constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, unless noted.
 """
 
 from __future__ import annotations
@@ -39,76 +42,90 @@ from ..stereo.sgm import DisparityRange
 from .tentative_matches import Pair
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
-"""Options of the row matcher; the range of disparities is found for each pair."""
+"""Options for matching rows. The range of disparities is set for each pair."""
 
 MAX_VOLUME = 5e7
-"""Pixels of the frame times disparities: larger images are scaled down to bound time and memory."""
+"""Maximum number of pixels of the frame times the number of disparities. Images that need more are
+scaled down, to bound time and memory."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """The range of disparities is extended at both ends by this many pixels plus this fraction of its
-length. Chosen on the data named above."""
+length. Chosen on the data sets that the module names."""
 
 MIN_FRACTION_OF_ONE_SIGN = 0.8
-"""If this fraction of the sparse matches moves away from an epipole, or towards it, the range
-extends only by `MARGIN_PX` in the other direction. Chosen on the data named above."""
+"""Disparities of one sign mean motion away from the epipole of a polar frame, those of the other
+sign motion towards it. If more than this fraction of the sparse matches has one sign, the range
+extends only by `MARGIN_PX` into the other sign. Chosen on the data sets that the module names."""
 
 CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
-"""Matched views are compared in windows of this side, blurred with this sigma."""
+"""The two rectified views are blurred with the second value as sigma, and correlated in windows
+with the first value as side."""
 
 MIN_CORRELATION = 0.3
-"""A match is dropped if its windows correlate less, unless `FALSE_DISCOVERY_RATE` allows it."""
+"""A match is dropped if the correlation of its windows is below this, unless `FALSE_DISCOVERY_RATE`
+allows a lower correlation."""
 
 FALSE_POSITIVE_RATE = 0.01
-"""Chance may match at most this fraction of the pixels, measured on rows that show something else,
-which sets a second bound on the correlation. Chosen on the data named above."""
+"""Besides `MIN_CORRELATION`, there is a second minimum of the correlation, set so that chance
+matches at most this fraction of the pixels. Matches between unrelated rows show how high chance
+correlations are. Chosen on the data sets that the module names."""
 
 FALSE_DISCOVERY_RATE = 0.01
-"""If chance gives at most this fraction of the matches, the two bounds above only hold for the
-matches that geometry relies on. Chosen on the data named above."""
+"""Matches with a correlation below `MIN_CORRELATION` or the minimum of `FALSE_POSITIVE_RATE` are
+kept as well if chance explains at most this fraction of all kept matches. The geometry does not
+rely on them. Chosen on the data sets that the module names."""
 
 NULL_FRACTION = 0.25
-"""This fraction of the rows is matched with unrelated rows to measure chance. Chosen by hand."""
+"""This fraction of the rows is matched with unrelated rows, to measure chance. Chosen by hand."""
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
-"""The images are not rectified again if the second fraction of the tracked corners has rows within
-the first distance of the lines of the new matrix. Chosen on the data named above."""
+"""The rows of tracked corners are compared with the epipolar lines of the refined matrix. The
+images are rectified again unless the second fraction of the corners, or more, lies within the first
+distance of the lines. Chosen on the data sets that the module names."""
 
 MAX_RANGE_EXCESS = 1.25
-"""Scaled-down images are also rectified again if the searched range was more than this times the
-range that was found. Chosen on the data named above."""
+"""Scaled-down images are also rectified again if the searched range was more than this many times
+the range of the disparities found. Chosen on the data sets that the module names."""
 
 MIN_SIGMA_PX = 0.1
-"""Tracks and sparse matches have at least this standard deviation. Chosen on the data named
-above."""
+"""Minimum standard deviation in pixels that is assumed for the positions of tracks and of sparse
+matches. Chosen on the data sets that the module names."""
 
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
-"""Corners that are tracked, and the side of their windows. Chosen on the data named above."""
+"""Maximum number of corners that are tracked, and the side in pixels of the windows around them.
+Chosen on the data sets that the module names."""
 
 MAX_TRACK_PX = 4.0
-"""A track is wrong if it ends further than this from its match. Chosen on the data named above."""
+"""A track is wrong if it ends farther than this from the match that row matching gives. Chosen on
+the data sets that the module names."""
 
 MIN_TRACKS = 50
-"""A pair with fewer tracks has no dense matches. Chosen on the data named above."""
+"""A pair with fewer tracked corners gets no dense matches. Chosen on the data sets that the module
+names."""
 
 NEAR_PLANE_FRACTION = 0.8
-"""If the whole range is too large to search, only the disparities of this fraction of the sparse
-matches, the nearest to a known plane, are searched: anything far in front of it is lost."""
+"""If too few corners can be tracked with the disparity range of all sparse matches, the range is
+reduced to that of this fraction of them, those nearest to a known plane. Anything far in front of
+the plane is then lost."""
 
 MAX_DISAGREEMENT_PX = 3.0
-"""A sparse match agrees with a disparity up to this difference, in pixels. It was found in images
-of another scale. Chosen on the data named above."""
+"""A sparse match agrees with the disparity at its start if its own disparity differs by less than
+this, in pixels. It need not agree better, because it was found in images of another scale. Chosen
+on the data sets that the module names."""
 
 MIN_AGREEMENT = 0.6
-"""This fraction of the sparse matches must agree with the disparities: on facades a quarter of them
-belong to the next window on the same line."""
+"""This fraction or more of the sparse matches must agree with the disparities. On facades, a
+quarter of the sparse matches end at the next window on the epipolar line."""
 
 
 @dataclass(frozen=True, eq=False)
 class RectifiedView:
-    """Two images, at `scale`, in a common frame, and the disparities between them, (H, W) each.
+    """Two rectified images and the disparities between them.
 
-    `disparity` is NaN where no match is kept. `relied` marks the matches that geometry may rely on.
-    `correlation` is the local ZNCC of both views once the disparity is removed.
+    `views` are the images in the `frame`, after scaling by `scale`. They and the following arrays
+    are (H, W). `searched` is the range of disparities that was tried. `disparity` is NaN where no
+    match is kept. `relied` marks the matches that geometry may rely on. `correlation` is the local
+    ZNCC of the first view and the second view shifted by the disparity.
     """
 
     frame: RectifiedFrame
@@ -120,15 +137,15 @@ class RectifiedView:
     correlation: np.ndarray
 
     def to_frame(self, points: np.ndarray, side: int) -> np.ndarray:
-        """Map points from an image at its own size to the frame."""
+        """Map points from an image of full size to the frame."""
         return self.frame.to_frame(scaled_points(points, self.scale), side)
 
     def from_frame(self, points: np.ndarray, side: int) -> np.ndarray:
-        """Map points from the frame to an image at its own size."""
+        """Map points from the frame to an image of full size."""
         return scaled_points(self.frame.from_frame(points, side), 1 / self.scale)
 
     def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the rows of the points inside the frame, and the nearest columns and rows."""
+        """Return the indices of the points inside the frame, and their pixels' columns and rows."""
         height, width = self.disparity.shape
         nearest = np.rint(np.where(np.isfinite(points), points, -1)).astype(np.int64)
         inside = np.flatnonzero(((nearest >= 0) & (nearest < (width, height))).all(axis=1))
@@ -147,7 +164,7 @@ def match_by_rectification(
     The `sparse` matches, (M, 2) in both images, agree with the fundamental matrix, x1^T F x0 = 0.
     If given, the homography of a `plane` of the scene warps the second view close to the first.
     Returns the refined matrix and the matches, which fit it exactly; None if too few corners can be
-    tracked, the sparse matches contradict, or the pair cannot be rectified.
+    tracked, the sparse matches contradict the disparities, or the pair cannot be rectified.
     """
     sizes = (grays[0].shape[::-1], grays[1].shape[::-1])
     view = rectified_view(grays, sparse, fundamental, plane)
@@ -172,7 +189,7 @@ def match_by_rectification(
                 fundamental = _refine(fundamental, sparse, tracks[0], sizes)
     if _agreement(view, sparse) < MIN_AGREEMENT:
         return None
-    # Where rows are off and could not be corrected, matches of low correlation are dropped.
+    # If the rows still do not fit the matrix, only matches that geometry relies on are kept.
     near = row_error * view.scale < MAX_ROW_ERROR_PX
     disparity = view.disparity if near else np.where(view.relied, view.disparity, np.nan)
     rows, ends, scores = _sample(view, disparity, xy0)
@@ -190,7 +207,7 @@ def rectified_view(
 ) -> RectifiedView | None:
     """Rectify both images, scaled down if there is too much to search, and match their rows.
 
-    `scale` is that of images that were already scaled down for this reason.
+    Callers leave `scale` out. The function sets it when it calls itself with scaled-down images.
     """
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     frame = rectified_frame(*sparse, fundamental, *sizes, plane)
@@ -207,12 +224,13 @@ def rectified_view(
         plane = None if plane is None else scaled_homography(plane, scale, scale)
         return rectified_view((small0, small1), (points0, points1), fundamental, plane, scale)
     (first, valid0), (second, valid1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
-    # About an epipole everything grows, or everything shrinks. Small copies also find disparities
-    # in the other direction, which are wrong.
+    # In a polar frame, all points move away from the epipole or all towards it. A small copy also
+    # gives disparities of the other sign, which are wrong, so only sparse matches give the range.
     seen = None if isinstance(frame, PolarFrame) else find_disparity_range(first, second)
     if seen is not None:
         widened = min(low, seen[0]), max(high, seen[1])
-        # This range may be far off where much of a frame is empty.
+        # The range from the small copy may be far off if much of the frame is empty. It is used
+        # only if the images can be searched over it at this size.
         if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
             low, high = widened
     widest = frame.size[0] - 1
@@ -220,8 +238,8 @@ def rectified_view(
     if searched[0] >= searched[1]:
         return None
     disparity, matched, correlation = _match_rows((first, second), (valid0, valid1), searched)
-    # Some rows are matched with unrelated rows of the second view: what is found there is found by
-    # chance, as the best of equally many disparities.
+    # Some rows are matched with unrelated rows of the second view, over as many disparities. All
+    # matches found there are due to chance.
     height = len(first)
     count = max(1, round(height * NULL_FRACTION))
     rows = (height - count) // 2 + np.arange(count)
@@ -239,7 +257,10 @@ def rectified_view(
 def _match_rows(
     views: Pair, shown: Pair, searched: DisparityRange
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return disparities, where they match content of both views, and the correlation there."""
+    """Return the disparities, which of them match content of both views, and their correlation.
+
+    All are (H, W). The correlation is -1 where nothing is matched.
+    """
     rows = compute_disparity(*views, replace(DISPARITY, disparity_range=searched))
     row, column = np.indices(rows.disparity.shape, dtype=np.float32)
     x = np.where(rows.matched, column - rows.disparity, -1).astype(np.float32)
@@ -259,16 +280,16 @@ def _match_rows(
 def _correlation_bounds(
     correlations: np.ndarray, pixels: int, null: np.ndarray, null_pixels: int
 ) -> tuple[float, float]:
-    """Return the least correlation of a match that geometry relies on, and of one that is kept.
+    """Return the minimum correlations of matches that geometry relies on, and of kept matches.
 
-    Both follow from the correlations of the matches and of chance matches (`null`), and from the
-    number of pixels that were searched for each.
+    `correlations` belong to the matches found in `pixels` pixels, `null` to the chance matches
+    found in `null_pixels` pixels.
     """
     null = np.sort(null)[::-1]
     allowed = int(FALSE_POSITIVE_RATE * null_pixels)
     high = max(MIN_CORRELATION, float(null[allowed]) if len(null) > allowed else -1.0)
-    # If hardly anything is found by chance, and nearly everything otherwise, low correlation is no
-    # reason for doubt: smooth surfaces are matched by what surrounds them.
+    # If chance gives hardly any matches and the pair gives many, matches of low correlation are
+    # credible: on smooth surfaces, the disparity comes from the surroundings.
     ordered = np.sort(correlations)
     bounds = np.append(-1.0, null[::-1])
     matches = len(ordered) - np.searchsorted(ordered, bounds)
@@ -278,7 +299,7 @@ def _correlation_bounds(
 
 
 def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
-    """Return the range of disparities of sparse matches, with a margin at both ends."""
+    """Return the range of the disparities of sparse matches, with a margin at both ends."""
     disparity = frame.to_frame(sparse[0], 0)[:, 0] - frame.to_frame(sparse[1], 1)[:, 0]
     disparity = disparity[np.isfinite(disparity)]
     if not len(disparity):
@@ -293,17 +314,18 @@ def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
 
 
 def _is_range_too_wide(view: RectifiedView) -> bool:
-    """Return whether a narrower range would have done, so that larger images can be matched."""
+    """Return whether images were scaled down for a range much wider than their matches need."""
     low, high = range_with_margin(view.disparity[view.relied], MARGIN_PX, MARGIN_FRACTION)
     searched = view.searched[1] - view.searched[0]
     return view.scale < 1 and searched > MAX_RANGE_EXCESS * (high - low)
 
 
 def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
-    """Track corners around their matches; None with fewer than `MIN_TRACKS`.
+    """Track corners to the second view, starting from the matches of the rows.
 
-    Returns their positions in both images at their own size. The third array holds the positions in
-    the second image if they are moved to the rows of the first, where row matching can find them.
+    Returns the positions of the corners in both images at full size, and the positions that the
+    tracks would have in the second image if they ended on the row where they start, as row matching
+    assumes. Returns None with fewer than `MIN_TRACKS` tracks.
     """
     first, second = (equalise(gray) for gray in view.views)
     mask = view.relied.astype(np.uint8)
@@ -329,7 +351,7 @@ def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
 def _refine(
     fundamental: np.ndarray, sparse: Pair, tracked: Pair, sizes: tuple[Size, Size]
 ) -> np.ndarray:
-    """Fit the fundamental matrix to tracks and sparse matches, weighted by their errors."""
+    """Fit the fundamental matrix to sparse matches and tracks, weighted by their median errors."""
     sigmas = []
     for points0, points1 in (sparse, tracked):
         errors = epipolar_errors(points0, points1, fundamental)
@@ -340,10 +362,10 @@ def _refine(
 
 
 def _agreement(view: RectifiedView, sparse: Pair) -> float:
-    """Return the fraction of the sparse matches with a disparity that agree with it.
+    """Return the fraction of sparse matches that agree with the disparity where they start.
 
-    Sparse matches are independent of the rows: if most disagree, the rows have matched the wrong
-    one of many similar things.
+    Sparse matches that start where geometry relies on no disparity are not counted. The others are
+    independent of the rows: if most disagree, rows were matched to similar but wrong places.
     """
     positions = [view.to_frame(points, side) for side, points in enumerate(sparse)]
     inside, column, row = view.pixels_of(positions[0])
@@ -366,14 +388,14 @@ def _moved_to_lines(
 def _sample(
     view: RectifiedView, disparity: np.ndarray, xy0: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows of the keypoints that have a disparity, their positions and scores."""
+    """Return the indices of keypoints that have a disparity, their partners and their scores."""
     height, width = disparity.shape
     positions = view.to_frame(xy0, 0)
     rows, column, row = view.pixels_of(positions)
     known = np.isfinite(disparity[row, column])
     rows, column, row = rows[known], column[known], row[known]
     positions, nearest = positions[rows], disparity[row, column]
-    # Bilinear interpolation over the neighbours on the same surface.
+    # The disparity is interpolated bilinearly over the neighbours on the same surface.
     left, top = np.floor(positions).astype(np.int64).T
     total, weights = np.zeros(len(rows)), np.full(len(rows), 1e-9)
     for down in (0, 1):
@@ -383,7 +405,7 @@ def _sample(
             weight = np.abs(1 - across - (positions[:, 0] - left)) * np.abs(
                 1 - down - (positions[:, 1] - top)
             )
-            weight *= np.abs(value - nearest) <= 1  # not for NaN
+            weight *= np.abs(value - nearest) <= 1  # False for NaN
             total += weight * np.nan_to_num(value - nearest)
             weights += weight
     shift = np.column_stack([nearest + total / weights, np.zeros(len(rows))])

@@ -20,24 +20,26 @@ from ...geometry.transforms import scaled_points, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 
 Pair = tuple[np.ndarray, np.ndarray]
-"""One array per image: both images, (H, W) uint8 luma, or matched positions, (M, 2) each."""
+"""Two arrays, one per image: images, (H, W) uint8 luma, or positions of matches, (M, 2) each."""
 
 MAX_SIDE_PX = 1200
-"""Images are reduced to this longer side: the initial geometry need not be fine. Chosen by hand."""
+"""Images with a longer side are scaled down to it, because the initial geometry may be coarse.
+Chosen by hand."""
 
 MAX_KEYPOINTS = 4000
-"""Maximum number of keypoints of each image. Chosen by hand."""
+"""Maximum number of keypoints that are detected in each image. Chosen by hand."""
 
 MIN_POINTS = 1000
-"""Points of all scales replace SIFT's keypoints if both images have at least this many, because the
-user asked for a number of points. Chosen by hand."""
+"""Multi-scale keypoints from the caller replace SIFT keypoints if each image has at least this
+many. There may be fewer, because the user chooses their number. Chosen by hand."""
 
 MAX_RATIOS = (0.85, 0.8)
-"""Bounds of the ratio test, tried in this order: the second gives fewer matches, but fewer wrong
-ones, and may show a geometry that the first does not show. Chosen by hand."""
+"""Limits of the ratio test, tried in this order. The second limit gives fewer matches but a smaller
+fraction of wrong ones, so it may show a geometry that the first does not show. Chosen by hand."""
 
 MIN_SEPARATION_PX = 2.0
-"""Matches that begin or end nearer together than this count as one. Chosen by hand."""
+"""Only one of several matches that start, or end, in one square cell of this side is kept. Chosen
+by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +48,10 @@ class TentativeMatches:
 
     Attributes:
         views: both images as uint8 luma, scaled down if they are large.
-        scales: scales of the views, at most 1.
+        scales: scales of the views relative to the full-size images, at most 1.
         features: keypoints of the views, with their descriptors.
-        matched: (M, 2) positions in both views.
-        ratios: (M,) ratios of the distances to the best and to the second-best descriptor.
+        matched: (M, 2) positions of the matches in each view.
+        ratios: (M,) ratios of the match's descriptor distance to that of the second-best match.
     """
 
     views: tuple[np.ndarray, np.ndarray]
@@ -74,7 +76,7 @@ class TentativeMatches:
         return TentativeMatches(views, scales, features, self.matched[::-1], self.ratios)
 
     def apart_from(self, homography: np.ndarray) -> TentativeMatches:
-        """Return the matches that do not agree with a homography between the whole images."""
+        """Return the matches that do not agree with a homography between the full-size images."""
         errors = transfer_errors(self.points0, self.points1, homography)
         left = errors > GUIDING_THRESHOLDS_PX["homography"] / self.scales[1]
         matched = self.matched[0][left], self.matched[1][left]
@@ -89,13 +91,13 @@ def find_tentative_matches(
     max_side_px: int = MAX_SIDE_PX,
     max_keypoints: int = MAX_KEYPOINTS,
 ) -> TentativeMatches:
-    """Match sparse SIFT keypoints of two images, exactly, mutually and by the ratio test.
+    """Match sparse keypoints of two images; keep mutual neighbours that pass the ratio test.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
-        features: keypoints of both images, scaled down if these are large, with descriptors; None
-            detects SIFT's keypoints.
-        max_side_px: longer sides are scaled down to this.
+        features: keypoints of both images with their descriptors, at positions in the images that
+            are scaled down to `max_side_px`. None: SIFT keypoints are detected.
+        max_side_px: images with a longer side are scaled down to it.
         max_keypoints: maximum number of keypoints that are detected in each image.
 
     Example:
@@ -115,10 +117,11 @@ def find_tentative_matches(
 
 
 def matches_of_points(grays: Pair, points: tuple[Keypoints, Keypoints]) -> TentativeMatches | None:
-    """Match the best points of all scales, at their own sizes and angles, as sparse keypoints.
+    """Match the best multi-scale keypoints that the caller gives, with learned descriptors.
 
-    If the light of both images differs, or one is blurred, they give two to five times as many
-    correct matches as SIFT's keypoints. None if there are too few, or they have no sizes or angles.
+    If the light differs between the images, or one is blurred, these keypoints give two to five
+    times as many correct matches as SIFT's. Returns None if either image has fewer than
+    `MIN_POINTS`, or if sizes or angles are missing.
     """
     if min(len(each) for each in points) < MIN_POINTS:
         return None
@@ -135,7 +138,7 @@ def matches_of_points(grays: Pair, points: tuple[Keypoints, Keypoints]) -> Tenta
 
 
 def match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
-    """Return matched positions in both images, and their ratios from the ratio test."""
+    """Match keypoints by descriptors; return positions in both images, and distance ratios."""
     assert first.descriptors is not None
     assert second.descriptors is not None
     match = partial(match_descriptors, matcher=exact_neighbours, ratio=max(MAX_RATIOS), mutual=True)
@@ -147,9 +150,10 @@ def match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
 
 
 def separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Keep each place once in each image: one corner in many views is no further evidence.
+    """Keep only one of several matches that start, or that end, at the same place.
 
-    The first two arrays are the positions in both images; the other arrays are filtered with them.
+    One corner that is found in many views is no further evidence. The first two arrays are the
+    positions in both images; the other arrays are filtered with them.
     """
     for side in (0, 1):
         cells = np.rint(matches[side] / MIN_SEPARATION_PX)
@@ -160,7 +164,7 @@ def separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def checked_positions(points: Any) -> Pair:
-    """Return another matcher's sparse matches, two (K, 2) arrays of finite numbers, as float64."""
+    """Check sparse matches of another matcher; return two (K, 2) float64 arrays of positions."""
     try:
         points0, points1 = (np.array(each, np.float64) for each in points)
     except (TypeError, ValueError):
@@ -170,5 +174,5 @@ def checked_positions(points: Any) -> Pair:
             "tentative matches must be two arrays of shape (K, 2): positions in both images"
         )
     if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
-        raise OptionError("tentative matches must be finite positions: leave out the others")
+        raise OptionError("tentative matches must be finite positions: leave out all other matches")
     return points0, points1

@@ -1,11 +1,12 @@
-"""Verification of matches: whether both patches look the same once the geometry is removed.
+"""Verification of matches: whether patches look the same once the two images are aligned.
 
-The second image is warped into the frame of the first, and SIFT descriptors of two sizes are
-compared by their correlation, after the mean descriptor, which all have in common, is subtracted.
-Null pairs, from the warped image shifted by a third of its size or more, show how similar unrelated
-patches of this pair are. A point passes if its descriptors, averaged with those of its neighbours,
-are more similar than nearly all null pairs, and if most points around it pass. Only points of a
-lattice are described, those nearest to the keypoints.
+The second image is warped into the frame of the first. At each point, SIFT descriptors of both
+images, in two sizes, are compared by their correlation. The mean descriptor is subtracted first,
+because it is common to all patches. Null pairs are pairs of unrelated patches: the warped image is
+shifted by a third of its size or more. They show how similar patches that do not match are in these
+images. A point passes if its descriptors, averaged with those of its neighbours, are more similar
+than those of nearly all null pairs, and if most points around it pass. To save time, descriptors
+are computed only at the points of a lattice that are nearest to the keypoints.
 """
 
 from __future__ import annotations
@@ -19,29 +20,31 @@ from ...features.sift import correlation_distance, dense_sift, sift_gradient, to
 from ...geometry.images import gaussian_means, window_sums
 
 DESCRIPTOR_REACH = 36
-"""Radius in pixels of the area that the largest descriptor depends on, with gradient and blur.
-Farther from all edges, shifting the image only shifts its descriptors, so they are computed
-once."""
+"""Radius in pixels of the area that the largest descriptor depends on, including gradient and blur.
+At points farther than this from the image border, shifting the image shifts the descriptors and
+does not change them, so they are computed only once."""
 
 KEYPOINT_SIZES_PX = (3.0, 8.0)
 """Descriptors are compared at these keypoint diameters. Chosen by hand."""
 
 LATTICE_PX = 3
-"""Spacing of the described points, in pixels: neighbours have nearly the same descriptors."""
+"""Spacing in pixels of the lattice points at which descriptors are computed. Pixels in between have
+nearly the same descriptors."""
 
 FALSE_POSITIVE_RATE = 0.01
 """Fraction of null pairs (unrelated patches of the two images) that pass. This bound and the sizes
 of the windows were chosen on nine pairs of Oxford with parts of their second images covered."""
 
 SMOOTHING_SIGMA_PX = 2.5
-"""Sigma of the Gaussian mean over neighbouring points, in pixels. Chosen by hand."""
+"""Sigma in pixels of the Gaussian weights with which the distances of neighbouring points are
+averaged. Chosen by hand."""
 
 WINDOWS_PX = (101, 31)
-"""A point passes if most points pass in windows of both sides around it. The smaller window is
-against chance matches around a small plane. It was chosen on six synthetic pairs."""
+"""Sides of two square windows around a point, which passes if most points in each window pass. The
+smaller one is against chance matches around a small plane. It was chosen on six synthetic pairs."""
 
 MIN_SUPPORT = 0.5
-"""Fraction of the points in a window that must pass: most of them."""
+"""A point passes only if at least this fraction of the points in each window around it passes."""
 
 NULL_SHIFTS = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shifts between the patches of a null pair, as fractions of width and height."""
@@ -50,22 +53,25 @@ NULL_BLOCK_PX = 64
 """Null pairs are taken from blocks of the image with this side. Chosen by hand."""
 
 MAX_NULL_BLOCKS = 256
-"""Each shift uses up to this many random blocks: all of them up to a megapixel."""
+"""Maximum number of random blocks for each shift. Images of up to a megapixel have no more blocks
+than this, so all of them are used."""
 
 MIN_POINTS_OF_MEAN = 100
-"""The mean descriptor is subtracted if there are this many: a mean of few is close to each one."""
+"""The mean descriptor is subtracted only if it is a mean of at least this many, because a mean of
+few descriptors is close to each of them."""
 
 MIN_NULL_DISTANCE = 1e-6
-"""The distance of equal descriptors is at most this, by rounding."""
+"""The distance of equal descriptors is 0, except for rounding errors of at most this."""
 
 
 @dataclass(frozen=True, eq=False)
 class NullPairs:
-    """Pairs of points, (N,) `rows`, and unrelated `partners`, (N, 2), for one shift of the image.
+    """Points of the first image paired with unrelated places of the second, for one shift.
 
-    For `interior` pairs no descriptor reaches an edge, so it is the same with and without the
-    shift. In all other pairs the edge of the first image cuts both patches. `shifted` is the second
-    image, shifted cyclically.
+    `rows`, (N,), are indices of described points, and `partners`, (N, 2), their unrelated places in
+    the second image before the shift. `shifted` is the second image, shifted cyclically. Both ends
+    of `interior` pairs are so far from the image border that their descriptors are the same with
+    and without the shift. In all other pairs, the border cuts the patches of both images.
     """
 
     rows: np.ndarray
@@ -77,12 +83,13 @@ class NullPairs:
 def dissimilarity(
     gray0: np.ndarray, warped: np.ndarray, valid: np.ndarray, pixels: np.ndarray, seed: int = 0
 ) -> np.ndarray:
-    """Compare patches of two aligned images around (N, 2) whole pixels of the first, `gray0`.
+    """Compare the patches of two aligned images around (N, 2) integer `pixels`.
 
-    `warped` is the second image in the frame of the first, with content where `valid`. Returns (N,)
-    float32: 1 - correlation, averaged over neighbours, divided by the bound below which the
-    fraction `FALSE_POSITIVE_RATE` of the null pairs lies. Infinite where there is no content, where
-    most points around are dissimilar, and everywhere if all null pairs look the same.
+    `warped` is the second image in the frame of the first, `gray0`, with content where `valid`.
+    Returns (N,) float32: 1 - correlation, averaged over neighbours, divided by the bound below
+    which the fraction `FALSE_POSITIVE_RATE` of the null pairs lies. Two patches match if the result
+    is below 1. It is infinite where there is no content, where most points around are dissimilar,
+    and everywhere if all null pairs look the same.
     """
     pixels = np.asarray(pixels).astype(np.int64)
     result = np.full(len(pixels), np.inf, np.float32)
@@ -117,14 +124,15 @@ def dissimilarity(
 def sample_null_pairs(
     points: np.ndarray, warped: np.ndarray, valid: np.ndarray, seed: int = 0
 ) -> list[NullPairs]:
-    """Pair points of some blocks with unrelated places of the second image, for each shift.
+    """For each shift, pair points in random blocks with unrelated places of the second image.
 
-    For the arguments see `dissimilarity`. Partners lie where the second image has content. Up to a
-    megapixel all blocks are taken, whatever the seed.
+    `points` are the (N, 2) described points; for the other arguments see `dissimilarity`. The
+    unrelated places lie where the second image has content. In images of up to a megapixel all
+    blocks are used, so the seed has no effect.
     """
     size = np.array(warped.shape[::-1])
-    # Shifts are multiples of the step, also across the edge: most partners then lie on the lattice,
-    # where one descriptor serves all shifts.
+    # The shifts and the period of the cyclic shift are multiples of the step. Most partners then
+    # lie on the lattice, where one descriptor serves all shifts.
     step = LATTICE_PX
     period = np.maximum(size // step, 1) * step
     rows_and_columns = [np.arange(length) for length in warped.shape]
@@ -136,7 +144,8 @@ def sample_null_pairs(
             (np.minimum(xy, end - 1 - xy) >= DESCRIPTOR_REACH).all(axis=1)
             for xy, end in ((points[rows], size), (partners, period))
         )
-        # If only the partner is near an edge, the shifted image has a seam that `warped` lacks.
+        # A pair is dropped if only its partner is near an edge, because the shifted image then has
+        # a seam there that `warped` does not have.
         kept = valid[partners[:, 1], partners[:, 0]] & (whole | ~inner)
         y, x = (
             (line - by) % end
@@ -150,7 +159,7 @@ def sample_null_pairs(
 def _distances(
     gray0: np.ndarray, warped: np.ndarray, points: np.ndarray, null_pairs: Sequence[NullPairs]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return 1 - correlation of the points and of the null pairs, summed over the sizes."""
+    """Return 1 - correlation at the points and of the null pairs, summed over keypoint sizes."""
     # Each place of the second image is described once, even if it is in several null pairs.
     used = [points, *(null.partners[null.interior] for null in null_pairs)]
     index = np.full(warped.shape, -1, np.int32)
@@ -186,7 +195,7 @@ def _distances(
 
 
 def _lattice_near(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    """Return the points of the lattice that are nearest to some pixels."""
+    """Return the lattice points, (M, 2) and each once, that are nearest to (N, 2) pixels."""
     last = (np.array(shape[1::-1]) - 1 - LATTICE_PX // 2) // LATTICE_PX
     index = np.clip(pixels // LATTICE_PX, 0, np.maximum(last, 0))
     used = np.zeros(index.max(axis=0) + 1, bool)
@@ -196,7 +205,10 @@ def _lattice_near(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
 
 
 def _sample_blocks(pixels: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Choose the points of whole blocks for each shift, because neighbours are averaged."""
+    """Return, for each shift, the indices of the points in randomly chosen blocks.
+
+    Whole blocks are used, because the results of neighbouring points are averaged.
+    """
     block = pixels // NULL_BLOCK_PX
     number = block[:, 1] * 1_000_000 + block[:, 0]
     order = np.random.default_rng(seed).permutation(np.unique(number))

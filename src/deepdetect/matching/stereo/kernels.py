@@ -1,7 +1,8 @@
-"""The compiled parts of stereo matching. Importing them takes numba; the first call compiles.
+"""The compiled parts of stereo matching. Importing them needs numba; first calls compile them.
 
 Kernels named `..._rows` process the rows `first` to `last - 1` of their arrays. The innermost axis
-is the disparity or the pixel of a row, so that vector registers process many. Sums have 16 bits.
+of an array is the disparity, or the column, so that vector instructions process many values at
+once. Sums of costs have 16 bits.
 """
 
 from __future__ import annotations
@@ -11,17 +12,18 @@ import numpy as np
 from ..._shared.kernels import compiled
 
 END = np.uint16(30000)
-"""Cost beyond both ends of a path's disparities: above any sum, with room to add a step."""
+"""Cost of the places beside the smallest and the largest disparity of a path. It is above any sum,
+and low enough that adding a penalty to it stays below 2^16."""
 
 BLOCK = 128
-"""Number of pixels of a row processed together, so that the sums stay in the L1 cache."""
+"""Number of pixels of a row that are processed together, so that the sums stay in the L1 cache."""
 
 
 @compiled(nogil=True)
 def census_rows(first, last, padded, out):  # type: ignore[no-untyped-def]
-    """Write for each pixel of `out`, (H, W) uint64, which neighbours are darker, one bit each.
+    """Write for each pixel which of its neighbours are darker, one bit each, to `out`.
 
-    `padded` is the uint8 image, padded by the radius of the window.
+    `padded` is the uint8 image, padded by the radius of the window, and `out` is (H, W) uint64.
     """
     height, width = out.shape
     radius_y, radius_x = (padded.shape[0] - height) // 2, (padded.shape[1] - width) // 2
@@ -39,7 +41,7 @@ def census_rows(first, last, padded, out):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, inline="always")
 def count_bits(word):  # type: ignore[no-untyped-def]
-    """Count the bits of a 64-bit word; the compiler knows this form as one instruction."""
+    """Count the 1 bits of a 64-bit word; the compiler turns this form into one instruction."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + (
         (word >> np.uint64(2)) & np.uint64(0x3333333333333333)
@@ -50,10 +52,10 @@ def count_bits(word):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def _distances(left, right_mirrored, min_disparity, outside, out):  # type: ignore[no-untyped-def]
-    """Write the Hamming distances of one row, (W, D) uint8."""
+    """Write the Hamming distances between the censuses of one row of both views, (W, D) uint8."""
     width, count = out.shape
     for x in range(width):
-        # The right column x - min_disparity - d is column width - 1 - (that) of the mirrored view.
+        # The right column c = x - min_disparity - d is column width - 1 - c of the mirrored view.
         start = width - 1 - x + min_disparity
         low = min(max(0, -start), count)
         high = max(min(count, width - start), low)
@@ -66,14 +68,14 @@ def _distances(left, right_mirrored, min_disparity, outside, out):  # type: igno
 
 @compiled(nogil=True)
 def cost_rows(first, last, left, right_mirrored, min_disparity, outside, cost):  # type: ignore[no-untyped-def]
-    """Write the costs, (H, W, D) uint8, of the disparities from `min_disparity` on.
+    """Write the costs of D disparities from `min_disparity` on, (H, W, D) uint8.
 
-    `left` and `right_mirrored` are (H, W) uint64 censuses, the right one mirrored left to right;
-    `outside` is the distance to a place outside the right image.
+    `left` and `right_mirrored` are (H, W) uint64 censuses, the right one mirrored left to right.
+    `outside` is the Hamming distance that is assumed for places outside the right image.
     """
     height, width, count = cost.shape
     line = np.empty((width, count), np.uint8)
-    sums = np.empty((3, width, count), np.uint8)  # along the row: at most 3 x 62
+    sums = np.empty((3, width, count), np.uint8)  # of three neighbours in a row: at most 3 x 62
     done = first - 2
     for y in range(first, last):
         for row in range(max(y - 1, done + 1), y + 2):
@@ -97,10 +99,10 @@ def cost_rows(first, last, left, right_mirrored, min_disparity, outside, cost): 
 def _step(before, least, cost, total, after, p1, p2):  # type: ignore[no-untyped-def]
     """Advance one pixel along a path, and return the lowest cost there.
 
-    `before` and `after`, (D + 2,) uint16, are the costs of the path, with one end on each side;
-    `least` is the lowest of `before`, and `cost`, (D,) uint8, are the matching costs of this pixel.
-    The path is added to `total`. `p1` and `p2` are the penalties for a disparity that changes by
-    one or more.
+    `before` and `after`, (D + 2,) uint16, are the costs of the path at the previous pixel and at
+    this pixel, with `END` on both sides. `least` is the lowest of `before`, and `cost`, (D,) uint8,
+    holds the matching costs of this pixel. The new costs of the path are added to `total`. `p1` is
+    the penalty for a disparity that changes by one, `p2` the penalty for a larger change.
     """
     count = cost.shape[0]
     jump = np.uint16(least + p2)
@@ -118,12 +120,14 @@ def _step(before, least, cost, total, after, p1, p2):  # type: ignore[no-untyped
 
 @compiled(nogil=True)
 def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # type: ignore[no-untyped-def]
-    """Add the costs along paths of some rows, or of some columns if they go `down` (1) or up (-1).
+    """Add to `total` the costs along the paths `first` to `last - 1` of one direction.
 
-    Each step goes one pixel to the `right` (1), to the left (-1), or straight (0). A diagonal path
-    that leaves at one side continues at the other, in its next row: there are as many paths as
-    columns, and each belongs to one call. `p2` is the penalty of a larger change, for each
-    difference of grey levels.
+    Each step goes one pixel `down` (1), up (-1) or along its row (0), and one pixel to the `right`
+    (1), to the left (-1) or straight (0). Paths along rows are numbered by their row, all others by
+    the column where they start. A diagonal path that leaves the image at one side continues at the
+    other side, in its next row. So there are as many paths as columns, and each belongs to one
+    call. `p1` is the penalty for a disparity that changes by one. `p2` has the penalty for a larger
+    change, for each difference of grey levels.
     """
     height, width, count = cost.shape
     paths, steps = last - first, height if down else width
@@ -156,9 +160,10 @@ def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # typ
 def best_of_rows(first, last, total, min_disparity, count, disparity, consistent, uniqueness_ratio):  # type: ignore[no-untyped-def]
     """Choose the disparity of lowest cost for each pixel, in both views.
 
-    `total` is (H, W, D) uint16 from `min_disparity` on; the first `count` disparities may be
-    chosen. The outputs are the fields of `sgm.SGMResult`. A parabola through the lowest cost and
-    its two neighbours makes the disparity sub-pixel. Views are consistent if they agree within one.
+    `total`, (H, W, D) uint16, has the costs of D disparities from `min_disparity` on, of which the
+    first `count` may be chosen. `disparity`, `consistent` and `uniqueness_ratio` are written; see
+    `sgm.SGMResult`. A parabola through the lowest cost and its two neighbours makes the disparity
+    sub-pixel. The views are consistent if their disparities differ by at most one.
     """
     width = total.shape[1]
     best = np.empty(width, np.int64)
@@ -167,7 +172,7 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
         keys[:] = np.uint32(0xFFFFFFFF)
         for x in range(width):
             sums = total[y, x]
-            # Places inside the right image: 0 <= x - min_disparity - d < width.
+            # Disparities that lead inside the right image: 0 <= x - min_disparity - d < width.
             low = min(max(0, x - min_disparity - width + 1), count)
             high = max(min(count, x - min_disparity + 1), low)
             least = inside = np.uint16(65535)
@@ -209,10 +214,11 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
 
 @compiled(nogil=True, fastmath=True)
 def smooth_rows(first, last, disparity, radius, max_difference, out):  # type: ignore[no-untyped-def]
-    """Write the mean disparity over the same surface around each pixel.
+    """Write for each pixel the mean disparity of the surface that it lies on, within a window.
 
-    `disparity` is padded by `radius`. Pixels of the window count in pairs, one on each side of the
-    centre, so that a slanted plane keeps its disparity, also next to an edge.
+    `disparity` is padded by `radius`. Two pixels on opposite sides of the centre count only
+    together, if both differ from it by at most `max_difference`. So a slanted plane keeps its
+    disparity, also next to an edge.
     """
     width = out.shape[1]
     total, weight = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -242,7 +248,8 @@ def smooth_rows(first, last, disparity, radius, max_difference, out):  # type: i
 def sample_rows(first, last, right, disparity, values, slopes):  # type: ignore[no-untyped-def]
     """Sample the right image at x - disparity by cubic interpolation (Catmull-Rom).
 
-    All arrays are (H, W) float32; `slopes` is the gradient along the row, in grey levels per pixel.
+    `values` and `slopes` are written. All arrays are (H, W) float32. `slopes` is the gradient of
+    the right image along the row, in grey levels per pixel.
     """
     width = right.shape[1]
     for y in range(first, last):
@@ -268,8 +275,10 @@ def step_rows(  # type: ignore[no-untyped-def]
     """Write the disparity after one Lucas-Kanade step along the row.
 
     In each window, gain * (values - change * slopes) + offset is fitted to the left grey values,
-    over the pixels of the same surface. Inputs are padded by `radius`. The step is damped where
-    slopes are below `noise`, and zero where the gain is below `min_gain`.
+    and `change` is added to the disparity. Only pixels of the same surface are used, whose
+    disparity differs by at most `max_difference` from that of the centre. All inputs are padded by
+    `radius`; `sample_rows` gives `values` and `slopes`. The change is damped where slopes are below
+    `noise`, and zero where the gain is below `min_gain`.
     """
     width = out.shape[1]
     n, p, v, s, vv, ss, vs, pv, ps = np.empty((9, BLOCK), np.float32)
@@ -281,7 +290,8 @@ def step_rows(  # type: ignore[no-untyped-def]
             # The grey level of the centre is subtracted: sums stay small and exact.
             middle = left[row, column : column + count]
             other = values[row, column : column + count]
-            # Sums over the window: pixels, left grey, right grey, slope, and their products.
+            # These are sums over the window: of 1 for each pixel (n), the left grey level (p), the
+            # right grey level (v), the slope (s), and of products of two of these.
             for total in (n, p, v, s, vv, ss, vs, pv, ps):
                 total[:] = 0
             for j in range(-radius, radius + 1):
@@ -338,11 +348,11 @@ def _line_at(sums, first, last, x):  # type: ignore[no-untyped-def]
 def extrapolate_rows(  # type: ignore[no-untyped-def]
     first, last, disparity, known, carried, sign, min_support, max_difference, out
 ):
-    """Extrapolate the first known surface to the left, where it is not visible.
+    """Extrapolate the first known surface of each row to the left, outside the other view.
 
-    `carried` holds whole disparities that the surfaces around suggest. The other view shows x at
-    x - sign * disparity, with -1 for mirrored views. `out` is only written where it is
-    extrapolated.
+    `carried` holds integer disparities, which semi-global matching has carried over from the
+    surfaces around. The other view shows column x at x - sign * disparity, where `sign` is 1, or -1
+    for mirrored views. `out` is written only where the surface is extrapolated.
     """
     width = disparity.shape[1]
     sums = np.zeros((4, width + 1), np.float64)

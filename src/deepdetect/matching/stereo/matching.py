@@ -27,37 +27,43 @@ from .sgm import (
 )
 
 MAX_SPECKLE_AREA_PX = 100
-"""Patches of one surface up to this size are dropped. Chosen by hand."""
+"""Isolated patches of one surface with at most this many pixels are dropped. Chosen by hand."""
 
 SPECKLE_SUBDIVISIONS = 4
-"""Steps per pixel of the integer disparities for OpenCV's speckle filter. Chosen by hand."""
+"""Disparities are rounded to this many steps per pixel, because OpenCV's speckle filter needs
+integers. Chosen by hand."""
 
 BORDER_PX = 4
-"""Matches this near to the border of the right image are dropped, because windows give content just
-outside the image the disparity of content inside. Chosen by hand."""
+"""Matches this near to the left or the right border of the right image are dropped, because windows
+give content just outside the image the disparity of content just inside. Chosen by hand."""
 
 OCCLUDING_EDGE_PX = 1
-"""Width of the edge of a nearer surface that is dropped if occlusions are filled."""
+"""Width in pixels of the edge of nearer surfaces that is dropped if occlusions are filled."""
 
 OCCLUSION_SLACK_PX = 8
-"""A gap may be this much wider than the disparity step: windows reach over both ends."""
+"""A gap between two surfaces may be an occlusion if it is at most this many pixels wider than their
+difference of disparity, because windows reach over both ends of the gap."""
 
 MIN_SUPPORT_PX = 5
-"""A line is fitted to at least this many known pixels. Chosen by hand."""
+"""A line that extrapolates a surface, or checks such a line, is fitted to at least this many known
+pixels. Chosen by hand."""
 
-# The range of disparities is searched on a small copy of the pair. With these values it covers all
-# of the Motorcycle pair and of the Middlebury scenes of the benchmark, and is not much wider.
+# If the caller gives no range of disparities, it is searched on a copy of the pair with this width
+# and this limit for patches. With the following values, the range covers all of the Motorcycle pair
+# and of the Middlebury scenes of the benchmark, and is not much wider.
 SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX = 160, 50
 SEARCH_UNIQUENESS_RATIO = 1.3
-"""Minimum cost of any other match on the row, relative to the best: rarely met by false matches."""
+"""Any other match on the row of the small copy must cost at least this many times as much as the
+best match. False matches rarely reach this ratio."""
 
 TAIL_FRACTION = 0.01
-"""This fraction of the disparities at each end may be wrong and is ignored. Chosen by hand."""
+"""This fraction of the disparities is ignored at each end of their range, because they may be
+wrong. Chosen by hand."""
 
 SEARCH_MARGIN_PX = 1.5
 SEARCH_MARGIN_FRACTION = 0.2
-"""The range is extended at both ends by the first, in pixels of the small copy, plus the second as
-a fraction of its length, for objects too small to be seen in the copy."""
+"""The range is extended at both ends by the first value, in pixels of the small copy, plus the
+second value times its length, because some objects are too small to be seen in the copy."""
 
 
 @suggest_keywords
@@ -66,18 +72,20 @@ class DisparityOptions:
     """How the disparities of a rectified pair are found, and which of them are kept.
 
     Attributes:
-        disparity_range: smallest and largest disparity in whole pixels; None: found from the pair.
-        uniqueness_ratio: lowest cost of any other match on the row, divided by that of the best
-            one.
-        discontinuity_margin_px: distance from disparity discontinuities, in pixels, within which
-            disparities are dropped: windows reach that far and give what lies beside a near object
-            its disparity. Objects up to twice as wide vanish. 0 keeps them.
-        fill_occlusions: give pixels that the right image does not show the disparity of the surface
-            next to them. Between two surfaces it is that of the farther one, if row and column
-            agree. Outside the right image the first visible surface is extrapolated along a line,
-            as far as the line predicts the surface itself and nothing above or below contradicts.
-            Filled pixels have no match (`DisparityMap.matched`). The outermost pixels of nearer
-            surfaces are dropped, because windows give them the nearer disparity too often.
+        disparity_range: smallest and largest disparity in integer pixels. None: the range is
+            estimated from the pair.
+        uniqueness_ratio: a disparity is kept if the lowest cost of any other match on the row,
+            divided by the cost of its own match, is at least this.
+        discontinuity_margin_px: disparities within this distance in pixels of a disparity
+            discontinuity are dropped, because windows reach that far and give pixels beside a near
+            object the disparity of the object. Objects up to twice as wide vanish. 0 drops nothing.
+        fill_occlusions: whether pixels that the right image does not show get the disparity of the
+            surface next to them. In a gap between two surfaces this is the farther surface, if the
+            row and the column of the pixel give the same disparity. For pixels that lie outside the
+            right image, the first visible surface is extrapolated along a line, as far as the line
+            predicts the surface itself and nothing above or below contradicts. Filled pixels have
+            no match (`DisparityMap.matched`). The outermost pixels of nearer surfaces are dropped,
+            because windows often give the nearer disparity to pixels of the farther surface there.
 
     Raises:
         OptionError: a value is out of its range.
@@ -92,7 +100,8 @@ class DisparityOptions:
         whole = self.disparity_range
         if whole and (np.shape(whole) != (2,) or any(d % 1 for d in whole) or whole[0] > whole[1]):
             raise OptionError(
-                f"disparity_range must be the smallest and the largest disparity, not {whole}"
+                "disparity_range must be the smallest and the largest disparity in whole pixels, "
+                f"not {whole}"
             )
         check_ranges(
             self,
@@ -109,8 +118,8 @@ class RectifiedMatches:
     """Keypoints of the left view of a rectified pair with their disparities.
 
     Attributes:
-        indices: (K,) int64, ascending: the keypoints that have a disparity.
-        disparity, matched: (K,) values of the `DisparityMap`.
+        indices: (K,) int64, ascending: indices of the keypoints that have a disparity.
+        disparity, matched: (K,) values of the two arrays of the `DisparityMap` at these keypoints.
     """
 
     indices: np.ndarray
@@ -126,12 +135,13 @@ class DisparityMap:
     """The disparity of each pixel of the left view of a rectified pair.
 
     Attributes:
-        disparity: (H, W) float32 in pixels: the match of the left (x, y) is the right
-            (x - disparity, y). NaN if no disparity is reliable.
-        matched: (H, W) bool: seen in both views, so that (x - disparity, y) lies in the right one.
-            False if the disparity is NaN, or filled in from a surface next to it: hidden in the
-            right view, or outside it.
-        disparity_range: smallest and largest disparity tried; None if the views do not agree.
+        disparity: (H, W) float32 in pixels: pixel (x, y) of the left view matches (x - disparity,
+            y) in the right view. NaN where no disparity is reliable.
+        matched: (H, W) bool, true where both views show the pixel, so that (x - disparity, y) lies
+            in the right view. False where the disparity is NaN, or was filled in from a surface
+            next to it because the pixel is hidden in the right view or lies outside it.
+        disparity_range: smallest and largest disparity that were tried; None if the range was to be
+            estimated and the views agree nowhere.
     """
 
     disparity: np.ndarray
@@ -147,10 +157,10 @@ class DisparityMap:
         """Return the disparities at keypoints: the map is only sampled, nothing is matched again.
 
         Args:
-            keypoints: keypoints of the left view, on whole pixels; or their (N, 2) positions.
+            keypoints: keypoints of the left view, on integer pixels, or their (N, 2) positions.
 
         Raises:
-            OptionError: they are not (N, 2), or not on pixels of the left view.
+            OptionError: the positions are not (N, 2), or not integer pixels of the left view.
         """
         xy = np.asarray(keypoints.xy if isinstance(keypoints, Keypoints) else keypoints)
         if xy.ndim != 2 or xy.shape[1] != 2:
@@ -186,7 +196,7 @@ def disparity_map(
     Args:
         image0, image1: the left and the right image, of the same size, anything `load_image` takes;
             only their luma is used.
-        options: what is matched and kept; `DENSE` gives as many pixels as possible.
+        options: how disparities are found, and which are kept; `DENSE` keeps as many as possible.
         channels: order of the colours in arrays: "rgb", or "bgr" as in OpenCV.
 
     Returns:
@@ -212,7 +222,7 @@ def disparity_map(
 def compute_disparity(
     left: np.ndarray, right: np.ndarray, options: DisparityOptions
 ) -> DisparityMap:
-    """Compute the `disparity_map` of (H, W) uint8 luma."""
+    """Compute the `disparity_map` of two views, (H, W) uint8 luma."""
     if left.shape != right.shape:
         sizes = " and ".join(f"{view.shape[1]}x{view.shape[0]}" for view in (left, right))
         raise ImageError(f"the images of a rectified pair must have the same size, not {sizes}")
@@ -223,7 +233,8 @@ def compute_disparity(
     low, high = (int(disparity) for disparity in disparities)
     if max(abs(low), abs(high)) >= left.shape[1]:
         raise OptionError(
-            f"disparities {low} to {high} exceed {left.shape[1]} pixels: narrow disparity_range"
+            f"disparities {low} to {high} exceed the image width of {left.shape[1]} pixels: "
+            "narrow disparity_range"
         )
     coarse = semi_global_matching(left, right, (low, high))
     clear = coarse.uniqueness_ratio >= options.uniqueness_ratio
@@ -249,17 +260,17 @@ def compute_disparity(
 
 
 def _leads_inside(disparity: np.ndarray, margin_px: float) -> np.ndarray:
-    """Return where disparities lead inside the right image, minus a margin; (H, W) bool."""
+    """Return which disparities lead into the right image, except for its margin; (H, W) bool."""
     width = disparity.shape[1]
     place = np.arange(width, dtype=np.float32) - disparity
     return (place >= margin_px - 0.5) & (place <= width - 0.5 - margin_px)
 
 
 def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange | None:
-    """Find the disparities of a rectified pair, of both signs and up to half its width.
+    """Find the disparity range of a rectified pair, of both signs and up to half its width.
 
-    A small copy is matched over all of them. The range is that of patches where both views agree,
-    or None.
+    A small copy of the pair is matched over all of these disparities. The range is that of the
+    patches where both views agree; None if they agree nowhere.
     """
     height, width = left.shape
     scale = max(width / SEARCH_WIDTH_PX, 1.0)
@@ -282,16 +293,17 @@ def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange 
 def range_with_margin(
     disparity: np.ndarray, margin_px: float, margin_fraction: float
 ) -> tuple[float, float]:
-    """Return the range of most disparities, with a margin at both ends."""
+    """Return the range of disparities without its tails (`TAIL_FRACTION`), plus a margin."""
     low, high = np.quantile(disparity, [TAIL_FRACTION, 1 - TAIL_FRACTION])
     margin = margin_px + margin_fraction * (high - low)
     return float(low - margin), float(high + margin)
 
 
 def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) -> np.ndarray:
-    """Return the known pixels without patches of at most `max_area_px`, which are mostly wrong.
+    """Return the mask of the known pixels without small patches, which are mostly wrong.
 
-    Neighbours in a patch differ by at most twice `MAX_DIFFERENCE_PX`.
+    Patches of at most `max_area_px` pixels are removed. Neighbours are in one patch if their
+    disparities differ by at most twice `MAX_DIFFERENCE_PX`.
     """
     invalid = np.iinfo(np.int16).min
     steps = np.where(known, np.rint(disparity * SPECKLE_SUBDIVISIONS), invalid).astype(np.int16)
@@ -301,10 +313,10 @@ def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) 
 
 
 def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
-    """Find the pixels within `distance_px` of a disparity discontinuity, along rows or columns.
+    """Return which pixels are within `distance_px` of a disparity discontinuity, (H, W) bool.
 
-    A window there sees both surfaces, and gives pixels next to the nearer one its disparity. Where
-    nothing is known, the farther of both sides is assumed to continue.
+    A window there covers two surfaces, and gives pixels beside the nearer surface the disparity of
+    that surface. Unknown pixels count as part of the farther surface on both sides of their row.
     """
     filled = fill_occlusions(disparity, known)[0]
     beside = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -314,10 +326,10 @@ def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: in
 
 
 def on_occluding_edge(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
-    """Find the outermost known pixels of surfaces in front of others, `distance_px` wide.
+    """Return which known pixels of nearer surfaces are within `distance_px` of a farther one.
 
-    Windows also give the nearer disparity to pixels just outside the surface, so these are the
-    least reliable. Where nothing is known, the farther of both sides is assumed to continue.
+    Windows also give the nearer disparity to pixels just outside the nearer surface, so these
+    pixels are the least reliable. Unknown pixels count as part of the farther surface beside them.
     """
     filled = fill_occlusions(disparity, known)[0]
     farthest = cv2.erode(filled, _square(distance_px))
@@ -329,11 +341,11 @@ def _square(radius_px: int) -> np.ndarray:
 
 
 def fill_occlusions(disparity: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill unknown pixels with the farther of the nearest known ones on both sides of their row.
+    """Fill unknown pixels with the smaller of the nearest known disparities left and right of them.
 
-    What the right view does not show lies behind the surface that occludes it. The disparity is 0
-    in rows where nothing is known. The second array is true if both sides are known and the gap is
-    no wider than the nearer surface can occlude.
+    The smaller disparity is taken because what the right view does not show lies behind the surface
+    that occludes it. Rows where nothing is known get 0. The second array, (H, W) bool, is true in
+    gaps between two known pixels that are no wider than the nearer surface can occlude.
     """
     width = disparity.shape[1]
     column = np.arange(width)
@@ -353,13 +365,13 @@ def fill_occlusions(disparity: np.ndarray, known: np.ndarray) -> tuple[np.ndarra
 def extrapolate_disparity(
     disparity: np.ndarray, known: np.ndarray, carried: np.ndarray
 ) -> np.ndarray:
-    """Extrapolate the first and the last known surface of each row to the border; else NaN.
+    """Extrapolate the first and the last known surface of each row to the border; NaN elsewhere.
 
-    Only pixels whose match would lie outside the right image are extrapolated, because visible
-    surfaces have matches of their own, and only where `carried`, the choice of semi-global
-    matching, agrees. The line is trusted n pixels beyond the surface if, at its edge, the line
-    through its pixels n to 2 n agrees with the line through its first n pixels to within
-    `MAX_DIFFERENCE_PX`.
+    Only pixels whose match would lie outside the right image are extrapolated, because pixels
+    inside have matches of their own. The disparity must also agree with `carried`, which
+    semi-global matching has chosen. A line is fitted to the surface. It is trusted up to n pixels
+    beyond the edge of the surface if, at this edge, a line fitted to pixels n to 2 n of the surface
+    agrees with a line fitted to the first n pixels to within `MAX_DIFFERENCE_PX`.
     """
     from .kernels import extrapolate_rows
 

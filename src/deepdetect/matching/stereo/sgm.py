@@ -1,9 +1,10 @@
 """Semi-global matching, and sub-pixel refinement of its disparities.
 
 Hirschmüller, "Stereo processing by semi-global matching and mutual information" (PAMI 2008), with
-census transforms (Zabih and Woodfill, ECCV 1994), which are invariant to the light. A parabola
-through the costs of three disparities is biased towards whole pixels. So it only starts a fit of
-the grey values along the row (Lucas and Kanade, 1981); `benchmarks/row_matching.py` measures both.
+census transforms (Zabih and Woodfill, ECCV 1994), which do not depend on brightness and contrast. A
+parabola through the costs of three disparities gives sub-pixel disparities that are biased towards
+integers. So they are only the start of a fit of the grey values along the row (Lucas and Kanade,
+1981). `benchmarks/row_matching.py` measures the errors of both steps.
 """
 
 from __future__ import annotations
@@ -23,78 +24,85 @@ CENSUS_RADIUS_Y = 3
 CENSUS_BITS = (2 * CENSUS_RADIUS_X + 1) * (2 * CENSUS_RADIUS_Y + 1) - 1
 
 WRONG_PLACE_BITS = CENSUS_BITS // 2
-"""Average distance of a wrong match: half of the comparisons differ."""
+"""Average Hamming distance of a wrong match in bits: half of the census comparisons differ."""
 
 COST_PER_BIT = 9 / 4
-"""A cost is the sum over 3 x 3 pixels, divided by four to fit into a byte."""
+"""Cost of one bit of Hamming distance. A cost is the sum of the distances of 3 x 3 pixels, divided
+by four to fit into a byte."""
 
 LANES = 16
 """The number of disparities is rounded up to a multiple of this, for vector registers."""
 
 VOLUME_BYTES = 400_000_000
-"""Larger cost volumes are processed in bands of rows, one after the other."""
+"""Cost volumes of more bytes than this are computed in bands of rows, one band after the other."""
 
 SAMPLED_ROW_STEP = 48
-"""One row in this many is sampled for the typical distance of matches. Chosen by hand."""
+"""The typical Hamming distance of matches is measured on one row in this many. Chosen by hand."""
 
 BAND_OVERLAP_PX = 32
-"""Paths enter a band from this many rows above and below it. Chosen by hand."""
+"""Each band is computed with this many additional rows above and below it, from which paths enter
+the band. Chosen by hand."""
 
-# The penalties are the best of a few that were tried on the Motorcycle pair. Noisy images of full
-# size would need larger ones.
+# The penalties are the best of a few values that were tried on the Motorcycle pair. Noisy images of
+# full size would need larger penalties.
 P1_BITS = 20
 """Penalty for a disparity that changes by one pixel along a path, in census bits per pixel."""
 
 P2_BITS = 100
-"""Penalty for a larger change where the grey level is constant, in the same unit."""
+"""Penalty for a larger change where the grey level is constant, in census bits per pixel."""
 
 P2_HALF_GRADIENT_LEVELS = 8
-"""Difference of grey levels at which P2 is halved."""
+"""Difference of grey levels between neighbours along a path at which P2 is half of `P2_BITS`."""
 
 MIN_P2_BITS = 1.25 * P1_BITS
 
 OUTSIDE_COST = 0.6
-"""Cost of a match outside the right image. The cost is 0 for the median of the pair's matches, and
-1 for a wrong match. In between, a surface that leaves the image is continued from its neighbours.
-With less, more content at the border is lost in noisy views."""
+"""Cost of a match outside the right image, on a scale where the median match of the pair costs 0
+and a wrong match 1. Because the cost is in between, a surface that leaves the image is continued
+from its neighbours. With a lower cost, more content at the border is lost in noisy views."""
 
 MAX_DIFFERENCE_PX = 1.0
 """Neighbouring disparities that differ by more are on different surfaces. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
-"""Radius of the fitted windows. It and the next five values were chosen on the Motorcycle pair."""
+"""Radius in pixels of the windows in which the grey values are fitted. It and the next five values
+were chosen on the Motorcycle pair."""
 
 SMOOTHING_RADIUS_PX = 4
-"""Radius of the mean over one surface before each iteration, against the parabola's bias."""
+"""Radius in pixels of the window in which the disparities of one surface are averaged before each
+iteration of the fit, to reduce the bias of the parabola."""
 
 FINAL_SMOOTHING_RADIUS_PX = 2
-"""Radius of the mean over one surface at the end."""
+"""Radius in pixels of the window in which the disparities of one surface are averaged after the
+last iteration of the fit."""
 
 ITERATIONS = 2
-"""Number of iterations of the fit."""
+"""Number of iterations of the fit of the grey values."""
 
 NOISE_LEVELS = 2.0
-"""Gradients below this are noise, in grey levels per pixel: the smoothed surface is then kept."""
+"""Gradients below this, in grey levels per pixel, are noise: the averaged disparity is kept."""
 
 MIN_GAIN = 0.2
-"""Minimum contrast of the right view relative to the left. Below it the right view shows something
-else, and the disparity is not refined."""
+"""Minimum of the factor by which the fit multiplies the right view's grey values to match the left
+view. If it is lower, the right view shows something else, and the disparity is not refined."""
 
 UNKNOWN = np.float32(1e9)
-"""An unknown disparity, so far from any other that it is never on the same surface."""
+"""Value that stands for an unknown disparity. It is so far from any other disparity that the two
+are never on the same surface."""
 
 Pair = tuple[np.ndarray, np.ndarray]
 
 DisparityRange = tuple[int, int]
-"""The smallest and the largest disparity tried, in whole pixels: the match of a left (x, y) is
-searched from the right x - largest to x - smallest."""
+"""The smallest and the largest disparity that are tried, in integer pixels. The match of column x
+in the left view is searched in columns x - largest to x - smallest of the right view."""
 
 
 class SGMResult(NamedTuple):
-    """Raw disparities of the left view, (H, W) each: float32 in pixels, and how certain they are.
+    """Raw disparities of the left view, float32 in pixels, and how certain they are; (H, W) each.
 
     `consistent`: the match lies inside the right image, and both views agree on it within a pixel.
-    `uniqueness_ratio`: lowest cost of any other match inside over that of this match; 1 outside.
+    `uniqueness_ratio`: the lowest cost of any other match inside the right image, more than a pixel
+    away, divided by the cost of this match; 1 if this match lies outside.
     """
 
     disparity: np.ndarray
@@ -105,9 +113,9 @@ class SGMResult(NamedTuple):
 def semi_global_matching(
     left: np.ndarray, right: np.ndarray, disparities: DisparityRange
 ) -> SGMResult:
-    """Match every pixel of the left view, (H, W) uint8 luma, along its row.
+    """Match every pixel of the left view along its row; both views are (H, W) uint8 luma.
 
-    A parabola makes the disparities sub-pixel, but they still cluster around whole pixels.
+    A parabola makes the disparities sub-pixel, but they still cluster around integers.
     """
     height, width = left.shape
     count = -(-(disparities[1] - disparities[0] + 1) // LANES) * LANES
@@ -140,7 +148,7 @@ def _least_costs(total: np.ndarray, disparities: DisparityRange) -> SGMResult:
 
 
 def census(gray: np.ndarray) -> np.ndarray:
-    """Return the census transform of a (H, W) uint8 image, one bit per neighbour; uint64."""
+    """Return the census transform of an (H, W) uint8 image, (H, W) uint64, a bit per neighbour."""
     from .kernels import census_rows
 
     x, y = CENSUS_RADIUS_X, CENSUS_RADIUS_Y
@@ -153,9 +161,10 @@ def census(gray: np.ndarray) -> np.ndarray:
 def matching_cost(
     censuses: Pair, min_disparity: int, count: int, outside: int = WRONG_PLACE_BITS
 ) -> np.ndarray:
-    """Return the costs of `count` disparities for each pixel of two censuses, (H, W, count) uint8.
+    """Return the costs of `count` disparities for each pixel, (H, W, count) uint8.
 
-    A cost is a quarter of the sum over 3 x 3 pixels; `outside` is the distance outside the image.
+    `censuses` are those of the left and the right view. A cost is a quarter of the sum of the
+    Hamming distances of 3 x 3 pixels; `outside` is the distance assumed outside the right view.
     """
     from .kernels import cost_rows
 
@@ -168,22 +177,24 @@ def matching_cost(
 
 
 def is_textured(gray: np.ndarray) -> np.ndarray:
-    """Return the pixels whose census window has more than one grey level; (H, W) bool.
+    """Return which pixels have more than one grey level in their census window; (H, W) bool.
 
-    All other pixels, which are saturated, black or drawn, cannot be matched.
+    All other pixels, for example in saturated, black or drawn areas, cannot be matched.
     """
     window = np.ones((2 * CENSUS_RADIUS_Y + 1, 2 * CENSUS_RADIUS_X + 1), np.uint8)
     return cv2.dilate(gray, window) > cv2.erode(gray, window)
 
 
 def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
-    """Return the median distance of a pair's matches in bits, from the censuses of some rows.
+    """Return the median Hamming distance of a pair's matches in bits, measured on some rows.
 
-    A match here has the least cost in both views, without paths. Noise increases its distance.
+    A match here is a pair of pixels that have the least cost for each other, without sums along
+    paths. Noise increases its distance.
     """
     height = len(censuses[0])
     centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)
-    # Costs are sums over three rows. Matches outside get the largest distance.
+    # Costs are sums over three rows, so three are needed for each sampled row. Matches outside the
+    # right view get the largest distance.
     rows = np.clip(centres[:, None] + [-1, 0, 1], 0, height - 1).ravel()
     tried = disparities[0], disparities[1] - disparities[0] + 1
     sampled = censuses[0][rows], censuses[1][rows]
@@ -213,7 +224,7 @@ def aggregate(gray: np.ndarray, cost: np.ndarray) -> np.ndarray:
 def refine_disparity(
     left: np.ndarray, right: np.ndarray, disparity: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
-    """Refine disparities that are accurate to a pixel to sub-pixel accuracy where they are known.
+    """Refine known disparities, which are accurate to a pixel, to sub-pixel accuracy.
 
     The views are (H, W) uint8 luma; `disparity` is (H, W) float32 and unchanged where unknown.
     """
@@ -239,7 +250,7 @@ def refine_disparity(
 
 
 def _smoothed(disparity: np.ndarray, known: np.ndarray, radius: int) -> np.ndarray:
-    """Return the mean disparity over the same surface around each known pixel, 0 elsewhere."""
+    """Return for each known pixel the mean disparity of its surface in a window, 0 elsewhere."""
     from .kernels import smooth_rows
 
     out = np.empty_like(disparity)
@@ -249,7 +260,7 @@ def _smoothed(disparity: np.ndarray, known: np.ndarray, radius: int) -> np.ndarr
 
 
 def _padded(values: np.ndarray, radius: int, known: np.ndarray | None = None) -> np.ndarray:
-    """Pad an image; unknown disparities and those of the border become `UNKNOWN`."""
+    """Pad an image with 0 or, if `known` is given, make added and unknown pixels `UNKNOWN`."""
     border = 0.0
     if known is not None:
         border, values = float(UNKNOWN), np.where(known, values, UNKNOWN)

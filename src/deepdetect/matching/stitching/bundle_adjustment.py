@@ -16,19 +16,22 @@ from ...geometry.camera import Camera, Size
 from ...geometry.transforms import transform_points
 
 MAX_ITERATIONS, MIN_STEP = 20, 1e-7
-"""The fit ends after this many iterations, or if the parameters change by less than the step."""
+"""The fit ends after the first number of iterations, or earlier if no parameter changes by more
+than the second value."""
 
 UNIT_PX = 500.0
 """Unit of length in the fit, chosen so that all entries of a homography have similar magnitudes."""
 
 HUBER_THRESHOLD_PX = 2.0
-"""Huber's loss reduces the weight of larger residuals. Chosen by hand; not measured."""
+"""Huber's loss reduces the weight of residuals above this. Chosen by hand; not measured."""
 
 FOCAL_LENGTHS = np.geomspace(0.3, 10, 100) * 640 / UNIT_PX
-"""Start values of the focal length, in units of the fit: 0.3 to 10 times the longer side."""
+"""Start values of the focal length, in units of the fit: 0.3 to 10 times 640 px, which is the
+default longer side of the registered images."""
 
 FOCAL_WEIGHT = 1e-4
-"""Weight of equal focal lengths: a difference of 10 % costs as much as a residual of 0.5 px."""
+"""Weight of the term that keeps all focal lengths equal: a difference of 10 % costs as much as a
+residual of 0.5 px."""
 
 Matrices = Mapping[int, np.ndarray]
 """A (3, 3) matrix for each image number."""
@@ -37,14 +40,16 @@ Sizes = Mapping[int, tuple[int, int]]
 """(width, height) for each image number."""
 
 Links = list[tuple[int, int, np.ndarray, np.ndarray]]
-"""Two image numbers, and their (M, 2) corresponding points in units of the fit."""
+"""The registered pairs, each as the numbers of both images and the corresponding points, (M, 2) in
+each image, in units of the fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredPair:
-    """Two images, by their numbers, related by a homography that dense keypoints confirm.
+    """The numbers of two images, and the homography between them that dense keypoints confirm.
 
-    `points` are matched keypoints of the first image, perhaps fewer than the number of `matches`.
+    `points`, (M, 2), are matched keypoints of the first image: all, or some if there are many.
+    `matches` is the number of all matches.
     """
 
     first: int
@@ -77,8 +82,8 @@ def adjust_homographies(
 ) -> tuple[dict[int, np.ndarray], float]:
     """Fit all homographies jointly to all pairs; the first one stays fixed.
 
-    `homographies` are start values, from each image to the frame of the first. Also returns the
-    root mean square of the residuals in pixels.
+    `homographies` are start values, which map each image to the frame of the first. Also returns
+    the root mean square of the residuals in pixels.
     """
     to_unit, current, links = _in_units(homographies, pairs, sizes)
     reference, *moving = homographies
@@ -87,7 +92,7 @@ def adjust_homographies(
     for _ in range(MAX_ITERATIONS):
         normal, right = _normal_equations(current, links, columns, directions)
         step = np.linalg.lstsq(normal, right, rcond=None)[0]
-        for number, column in columns.items():  # update H (I + E); the last element of E is 0
+        for number, column in columns.items():  # H becomes H (I + E); E[2, 2] is 0
             change = np.append(step[column : column + 8], 0).reshape(3, 3)
             current[number] = _unit_determinant(current[number] @ (np.eye(3) + change))
         if np.abs(step).max(initial=0) < MIN_STEP:
@@ -132,7 +137,7 @@ def level_cameras(cameras: Cameras, reference: int) -> dict[int, RotatingCamera]
 
     The horizon is the plane to which the rows of all images are nearly parallel (Brown and Lowe,
     "Automatic panoramic image stitching using invariant features", 2007). If the rows do not
-    determine it, it is perpendicular to the mean of the columns.
+    determine this plane, it is the one perpendicular to the mean direction of the columns.
     """
     across = np.array([camera.rotation[:, 0] for camera in cameras.values()])
     down = np.mean([camera.rotation[:, 1] for camera in cameras.values()], axis=0)
@@ -160,7 +165,7 @@ def _in_units(
     }
     links = []
     for pair in pairs:
-        # The homography is more accurate than keypoints at integer pixels.
+        # The targets come from the homography: it is more accurate than integer keypoints.
         targets = transform_points(pair.points, pair.homography)
         points = transform_points(pair.points, to_unit[pair.first])
         targets = transform_points(targets, to_unit[pair.second])
@@ -173,8 +178,9 @@ def _normal_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return both sides of the normal equations.
 
-    `columns` gives the index of an image's first parameter, `directions` the (9, P) derivatives of
-    E by its parameters, where E updates a homography to H (I + E).
+    `columns` gives the index of the first parameter of each image that is not fixed. `directions`
+    gives the (9, P) derivatives of the matrix E by the P parameters of the image, where E updates a
+    homography H to H (I + E).
     """
     count = sum(matrix.shape[1] for matrix in directions.values())
     normal, right = np.zeros((count, count)), np.zeros(count)
@@ -200,7 +206,10 @@ def _normal_equations(
 def _linearised(
     first: np.ndarray, second: np.ndarray, points: np.ndarray, targets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (M, 2) residuals in the second image and their (M, 2, 9) derivatives by each E."""
+    """Return (M, 2) residuals in the second image and their derivatives by the E of each image.
+
+    The derivatives are (M, 2, 9) for each of the two images; see `_normal_equations` for E.
+    """
     between = np.linalg.inv(second) @ first
     homogeneous = np.column_stack([points, np.ones(len(points))])
     mapped = homogeneous @ between.T
@@ -224,7 +233,7 @@ def _residual_px(current: Matrices, links: Links) -> float:
 
 
 def _rotations(homographies: Matrices, focal: float) -> tuple[dict[int, np.ndarray], float]:
-    """Return the rotations nearest to homographies in units, and their distance from them."""
+    """Return the rotations nearest to homographies in units of the fit, and the squared misfit."""
     rotations, misfit = {}, 0.0
     for number, matrix in homographies.items():
         left, stretch, right = np.linalg.svd(

@@ -29,23 +29,23 @@ Box = tuple[int, int, int, int]
 """Left, top, right and bottom in pixels; right and bottom are exclusive."""
 
 MAX_DEPTH_RATIO = 5.0
-"""The depths of an image's corners may differ by this ratio on a flat canvas, because images near
-the horizon are stretched without bound. Chosen by hand; not measured."""
+"""The depths of an image's corners on a flat canvas must differ by less than this factor, because
+images near the horizon are stretched without bound. Chosen by hand; not measured."""
 
 MIN_WARP_SCALE = 0.67
-"""Images drawn at a smaller scale are blurred first, because they would alias."""
+"""Images drawn at a scale below this are blurred first, because they would alias otherwise."""
 
 MIN_SHOWN_PX = 16
-"""Images drawn smaller are blurred as if their longer side had this many pixels, because wider
-blurs take minutes."""
+"""An image whose longer side is drawn with fewer pixels is blurred as if it had this many, because
+wider blurs take minutes."""
 
 
 @dataclass(frozen=True, eq=False)
 class WarpedImage:
-    """An image warped to the canvas, with its left and top at `corner`.
+    """An image warped to the canvas, with its top left pixel at `corner`, (x, y).
 
-    The image is (h, w, 3) uint8 or uint16, mirrored beyond its borders. The (h, w) uint8 mask is
-    255 inside.
+    `image` is (h, w, 3) uint8 or uint16, and mirrored beyond the borders of the original image.
+    `mask`, (h, w) uint8, is 255 inside these borders and 0 beyond them.
     """
 
     image: np.ndarray
@@ -55,10 +55,13 @@ class WarpedImage:
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """Boxes of images on a canvas by image number, or by ~number for the rest of a split image.
+    """The boxes that images cover on a canvas, and the function that draws them there.
 
-    `draw(place, rgb, scale_of_image, scale_of_canvas)` warps an image; the scales are those of
-    reduced copies. A `closed` canvas shows 360 degrees, so its right border continues at the left.
+    The keys of `boxes` are image numbers. If the border of a closed canvas splits an image, the
+    rest of it has a second box, with the key ~number. `draw(place, rgb, scale_of_image,
+    scale_of_canvas)` warps an image for the box with the key `place`. The scales are those of a
+    reduced copy of the image and of the canvas, 1 at full size. A `closed` canvas shows 360
+    degrees, so its right border continues at the left.
     """
 
     boxes: dict[int, Box]
@@ -72,7 +75,7 @@ class Canvas:
         return right, bottom
 
     def check_size(self, max_megapixels: float) -> None:
-        """Raise an OptionError if it has too many pixels or needs too much memory."""
+        """Raise an OptionError if the canvas has too many pixels or needs too much memory."""
         width, height = self.size
         if width * height > max_megapixels * 1e6:
             raise OptionError(
@@ -105,7 +108,7 @@ def plan_plane(
 ) -> tuple[Canvas, dict[int, np.ndarray]]:
     """Find the smallest flat canvas that holds all images.
 
-    It has `scale` pixels per pixel of the reference. The given homographies map to any common
+    It has `scale` pixels per pixel of the reference image. The given homographies map to any common
     frame, the returned ones to the canvas.
     """
     back = np.linalg.inv(homographies[reference])
@@ -119,7 +122,7 @@ def plan_plane(
                 "projection 'cylindrical'"
             )
     placed = {number: scaled_homography(matrix, 1, scale) for number, matrix in placed.items()}
-    # A pixel belongs to an image if its centre does.
+    # A pixel belongs to an image if its centre lies inside the image.
     edges = {n: transform_points(outer_corners(sizes[n]), matrix) for n, matrix in placed.items()}
     low = np.ceil(np.min([edge.min(0) for edge in edges.values()], axis=0))
     boxes = {}
@@ -156,16 +159,17 @@ def plan_curved(
 ) -> Canvas:
     """Find the smallest canvas of all images on a cylinder or a sphere.
 
-    It has `scale` pixels per pixel at the centre of the reference; a full turn is rounded to whole
-    pixels. If the images show 360 degrees, it is cut through the image opposite the reference.
+    The canvas has `scale` pixels per pixel at the centre of the reference image, and a full turn is
+    rounded to a whole number of pixels. If the images show 360 degrees, the borders of the canvas
+    cut through the image opposite the reference.
     """
     turn = round(2 * np.pi * cameras[reference].focal_px * scale)
     angles = {n: float(np.arctan2(*one.rotation[[0, 2], 2])) for n, one in cameras.items()}
 
     def aimed(number: int, start: float, canvas_scale: float, image_scale: float) -> Any:
-        """Return a warper, its camera matrices, and the column of its origin.
+        """Return a warper for an image, its camera matrices, and the canvas column of its origin.
 
-        The camera looks at the image, so that the warped image is not split.
+        The origin lies in the middle of the image, so that the warped image is not split.
         """
         radius = turn * canvas_scale / (2 * np.pi)
         middle = round((angles[number] - start) % (2 * np.pi) * radius)
@@ -187,7 +191,7 @@ def plan_curved(
     closed = len(np.unique(np.concatenate(columns))) == turn
     if closed:
         start = min(angles.values(), key=lambda angle: np.cos(angle - angles[reference]))
-    else:  # cut in the widest gap
+    else:  # the canvas is cut in the widest gap
         order = np.sort([*angles.values()])
         gaps = np.diff(np.append(order, order[0] + 2 * np.pi))
         start = float((order + gaps / 2)[gaps.argmax()])
@@ -225,23 +229,24 @@ def plan_curved(
 
 
 def image_of(place: int) -> int:
-    """Return the image number of a box key; ~number stands for the rest of a split image."""
+    """Return the image number of a key of `Canvas.boxes`, which is the number or ~number."""
     return max(place, ~place)
 
 
 def _smooth(rgb: np.ndarray, shown: float) -> np.ndarray:
-    """Blur an image that is drawn much smaller, against aliasing."""
+    """Blur an image against aliasing if the scale at which it is drawn, `shown`, is small."""
     if shown >= MIN_WARP_SCALE:
         return rgb
     return antialiased(rgb, max(shown, MIN_SHOWN_PX / max(rgb.shape)))
 
 
 def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
-    """Return the depths of an image's corners, (4,), in front of the camera of the frame.
+    """Return the depths of an image's corners, (4,), as seen by the camera of the common frame.
 
-    For equal cameras that only rotate, depths are proportional to the cosine of the angle from the
-    axis. They are negative behind the horizon.
+    For equal cameras that only rotate, a depth is proportional to the cosine of the angle between
+    the corner and the optical axis of that camera. Beyond the horizon, depths are negative.
     """
-    # A homography's factor is arbitrary, but rotations have a positive determinant.
+    # The factor of a homography is arbitrary. It is chosen so that the determinant is 1, as for a
+    # rotation, which gives depths their sign.
     matrix = homography / np.cbrt(np.linalg.det(homography))
     return outer_corners(size) @ matrix[2, :2] + matrix[2, 2]

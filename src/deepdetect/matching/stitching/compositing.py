@@ -1,8 +1,7 @@
 """Composite the images of a panorama on their canvas.
 
-Exposure and seams are found on small copies. Images are warped one after another and blended in
-frequency bands (Burt and Adelson, "A multiresolution spline with application to image mosaics",
-1983).
+Exposure and seams are found on small copies. Images are warped one by one and blended in frequency
+bands (Burt and Adelson, "A multiresolution spline with application to image mosaics", 1983).
 """
 
 from __future__ import annotations
@@ -19,20 +18,23 @@ NUM_BANDS = 5
 """Number of frequency bands; the coarsest blends over about 2^5 pixels."""
 
 SEAM_MEGAPIXELS = 0.5
-"""Exposure and seams are found on a small canvas of at most this size. Chosen by hand."""
+"""Exposure and seams are found on a canvas of at most this many megapixels. Chosen by hand."""
 
 MIN_OVERLAP_PX = 100
-"""Brightness is compared if two images share more pixels of the small canvas. Chosen by hand."""
+"""Two images are compared in brightness and in parallax only if they share at least this many
+pixels of the small canvas. Chosen by hand."""
 
 SEAM_TOLERANCE_PX, SEAM_PERCENT = 1.0, 90.0
-"""Parallax is reported if this percentile of displacements along a seam exceeds the tolerance, in
-pixels of the small canvas, since smaller ones would be invisible on a screen."""
+"""Parallax is reported if the displacements along a seam exceed the first value, in pixels of the
+small canvas, at the percentile given by the second. Smaller ones would be invisible on a screen."""
 
 MIN_FLOW_PX = 32
-"""Optical flow needs an overlap with at least this side. Chosen by hand; not measured."""
+"""Optical flow is computed only if both sides of an overlap have at least this many pixels. Chosen
+by hand; not measured."""
 
 GAIN_ERROR_STD, GAIN_PRIOR_STD = 0.05, 0.5
-"""Standard deviations of log brightness ratios in overlaps, and of log gains. Chosen by hand."""
+"""The first is the standard deviation of the log brightness ratio of two images in their overlap,
+the second that of the log gain of an image. Both were chosen by hand."""
 
 
 def composite(
@@ -42,15 +44,15 @@ def composite(
 ) -> tuple[np.ndarray, np.ndarray, dict[int, float], dict[tuple[int, int], float]]:
     """Composite images on a canvas.
 
-    `load` returns an image by number, (H, W, 3) RGB, uint8 or uint16; it is called once per box.
-    `small` holds reduced uint8 copies and their scales. Returns the panorama (black outside, uint16
-    if an image is), its mask, the gain of each image, and the parallax of pairs whose images differ
-    too much along their seam, in pixels of the panorama.
+    `load` returns an image by its number, (H, W, 3) RGB, uint8 or uint16; it is called once per
+    box. `small` holds a reduced uint8 copy of each image, and its scale. Returns the panorama
+    (black outside all images, uint16 if any image is), its mask, the gain of each image, and the
+    displacement in pixels of the panorama of pairs with visible parallax along their seam.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
     low = {place: canvas.draw(place, *small[image_of(place)], scale) for place in canvas.boxes}
-    low = {place: one for place, one in low.items() if one.mask.size}  # some are too narrow
+    low = {place: one for place, one in low.items() if one.mask.size}  # some are empty
     gains = _gains(low)
     seams = _seams(low, gains)
     parallax = {pair: px / scale for pair, px in _parallax(low, gains, seams).items()}
@@ -87,7 +89,7 @@ class _Blender:
     ) -> None:
         """Add an image, multiplied by a factor, where its mask is 255."""
         (height, width), (x, y), step = mask.shape, corner, 1 << NUM_BANDS
-        # The box is extended to whole coarse pixels and by the blur of the mask.
+        # The box is enlarged to whole pixels of the coarsest band, and by the mask's blur.
         rows, columns = self.weights[0].shape
         top, left = (max(0, (start // step - 2) * step) for start in (y, x))
         bottom = min(rows, (-(-(y + height) // step) + 2) * step)
@@ -109,7 +111,7 @@ class _Blender:
             band, weight = coarse, cv2.pyrDown(weight)
 
     def blend(self) -> np.ndarray:
-        """Return the blended float32 image, padded to coarse pixels; consumes the sums."""
+        """Return the blended float32 image, padded to the coarsest band, and delete the sums."""
         image: np.ndarray | None = None
         while self.sums:
             band, weight = self.sums.pop(), self.weights.pop()
@@ -156,7 +158,7 @@ def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, floa
 
 
 def _overlap(first: WarpedImage, second: WarpedImage) -> list[tuple[slice, slice]]:
-    """Return rows and columns of the overlap box in both images; it may be empty."""
+    """Return the slices of the overlap box, rows and columns, in each image; they may be empty."""
     both = first, second
     left, top = np.max([one.corner for one in both], axis=0)
     right, bottom = np.min([np.add(one.corner, one.mask.shape[::-1]) for one in both], axis=0)
@@ -169,7 +171,7 @@ def _overlap(first: WarpedImage, second: WarpedImage) -> list[tuple[slice, slice
 def _parallax(
     low: Mapping[int, WarpedImage], gains: Mapping[int, float], seams: Mapping[int, np.ndarray]
 ) -> dict[tuple[int, int], float]:
-    """Find the displacement in pixels along the seams of pairs that differ too much."""
+    """Find the pairs with visible parallax along their seam, and its displacement in pixels."""
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     found: dict[tuple[int, int], float] = {}
     for places in combinations(low, 2):
@@ -219,8 +221,9 @@ def _upscale_mask(seam: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def crop_box(valid: np.ndarray, whole_rows: bool = False) -> Box:
     """Return the largest rectangle of an (H, W) bool mask that is true everywhere.
 
-    With `whole_rows` it has the full width if any row is true everywhere. For each row it tracks
-    the height of the run that ends in each column, and how far that height extends sideways.
+    If `whole_rows`, the rectangle has the full width, provided that any row is true everywhere. For
+    each row, the search tracks the height of the run of true pixels that ends in each column, and
+    how far that height extends sideways.
     """
     if whole_rows and valid.all(axis=1).any():
         valid = np.repeat(valid.all(axis=1, keepdims=True), valid.shape[1], axis=1)

@@ -61,16 +61,17 @@ class Panorama:
             otherwise uint8.
         valid: (H, W) bool, true where an image is.
         homographies: (3, 3) homographies by image number, in the order in which images were
-            connected. They map to `image` for a flat panorama, else to the reference.
-        reference: number of the image that is undistorted, or in the middle of a curved panorama.
+            connected. For a flat panorama they map to `image`, otherwise to the reference image.
+        reference: number of the undistorted image, or of the middle one of a curved panorama.
         unregistered: by image number, the reason why an image is not in the panorama.
         matches: number of dense matches of each registered pair.
-        residual_px: root mean square distance between the pairs' homographies and the panorama's,
-            in pixels of the registration; 0 for a flat panorama without closed loops.
+        residual_px: root mean square distance between the positions to which the homographies of
+            pairs and those of the panorama map matched keypoints, in pixels of the images reduced
+            for registration; 0 for a flat panorama without closed loops.
         gains: brightness factor of each image.
-        seconds: time of each stage.
-        parallax: displacement along the seam of two images, in panorama pixels, for pairs where it
-            is visible because the camera moved.
+        seconds: time of each stage, by its name.
+        parallax: displacement along the seam in panorama pixels, by the numbers of both images, for
+            pairs where it is visible because the camera moved.
         closed: whether the panorama shows 360 degrees, and its right border continues at the left.
     """
 
@@ -95,7 +96,10 @@ class Panorama:
 
 
 def stages_of(count: int) -> list[str]:
-    """Return the stages that `stitch` reports for `count` images, also each image and pair."""
+    """Return the names of the stages that `stitch` reports for `count` images, in order.
+
+    "keypoints" is reported once for each image, and "overlaps" once for each pair of images.
+    """
     each = ["keypoints"] * count + ["overlaps"] * (count * (count - 1) // 2)
     return ["reading", *each, "registration", "compositing"]
 
@@ -115,35 +119,36 @@ def stitch(
 ) -> Panorama:
     """Stitch images taken from one place, or of a plane, to a panorama.
 
-    Pairs are registered by guided matching at reduced size, and all are refined jointly. Images
-    are blended on one canvas with equal brightness and seams where they differ least. A flat canvas
-    shows less than 180 degrees, in practice 100 to 120; a cylinder or a sphere shows up to 360.
+    Pairs are registered by guided matching at reduced size, and all homographies are refined
+    jointly. The brightness of the images is equalised, and they are blended on one canvas along
+    seams where they differ least. A flat canvas shows less than 180 degrees, in practice 100 to
+    120; a cylinder or a sphere shows up to 360.
 
     Args:
         images: two or more images in any order, in any form that `load_image` accepts. Paths are
             loaded one at a time, so that only one full-size image is in memory.
-        detector: a `DeepDetect` or an object with a `heatmap` method: SIFT keypoints find overlaps
-            and dense keypoints confirm them. Or a `PointDetector`, whose points do both. Default
-            `DeepDetect()`.
+        detector: a `DeepDetect`, or another object with a method `heatmap`: SIFT keypoints then
+            find overlaps, and dense keypoints confirm them. Or a `PointDetector`, or another object
+            with only a method `detect`: its keypoints then do both. Default `DeepDetect()`.
         channels: order of the colour channels in images that are arrays, as in `load_image`.
         projection: "plane" keeps lines straight; "cylindrical" and "spherical" need cameras that
             only rotated, and level the horizon.
-        crop: crop the panorama to the largest rectangle without black.
+        crop: crop the panorama to the largest rectangle without black areas.
         reference: number of the undistorted image of a flat panorama, or of the middle image of a
             curved one; None chooses the image that distorts the others least.
         seed: seed of all random choices.
-        options: scale, limits and sizes.
+        options: scale, size limit and registration size of the panorama.
         progress: called with the name of each stage (`stages_of`) when it ends.
 
     Returns:
         The panorama of all images that could be connected.
 
     Raises:
-        ImageError: an image cannot be read or is not fit.
+        ImageError: an image cannot be read or is unsuitable.
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
-        RegistrationError: no two images overlap, one reaches the horizon of the reference, or the
-            cameras of a curved panorama did not only rotate.
+        RegistrationError: no two images overlap, an image is too oblique to the reference for a
+            flat panorama, or the cameras of a curved panorama did not only rotate.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -224,7 +229,8 @@ def _plan(
 ) -> tuple[Canvas, dict[int, np.ndarray], int]:
     """Return the canvas, the homographies of the panorama, and the number of the reference.
 
-    `scales` are the factors of the images for registration, `sizes` their full sizes.
+    `scales` are the factors by which images were reduced for registration, and `sizes` their full
+    (width, height), by image number.
     """
     if projection == "plane" or registration.cameras is None:
         homographies = {

@@ -35,31 +35,35 @@ MAX_KEYPOINTS = 30_000
 """A homography is confirmed by at most this many dense keypoints per image. Chosen by hand."""
 
 MIN_PARTNERS = 3
-"""A pair of connected images is skipped if both have this many partners, since it takes time."""
+"""A pair is not registered if other pairs already connect its images and each image has at least
+this many registered partners, since a registration takes time."""
 
 MIN_OVERLAP = 0.1
-"""A pair is tried again if the fit maps at least this fraction of an image's keypoints into the
-other. Chosen by hand; not measured."""
+"""An unregistered pair is tried again if the joint fit maps at least this fraction of one image's
+keypoints into the other image. Chosen by hand; not measured."""
 
 MAX_FURTHER_TRIALS = 2
-"""Number of further geometries to try if dense matches reject the first; each takes time."""
+"""If dense matches reject a geometry, up to this many others are tried, each of which takes
+time."""
 
 MAX_DISAGREEMENT_PX = 2.0
-"""A pair is tried again if its root mean square residual is larger. Chosen by hand."""
+"""A registered pair is registered again if the root mean square distance between its homography and
+the joint fit is larger. Chosen by hand."""
 
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MAX_CAMERA_RESIDUAL_PX = 3.0
-"""Cameras that only rotate have smaller residuals: 0.2 to 1 px without parallax."""
+"""Cameras that only rotate have smaller RMS residuals: 0.2 to 1 px without parallax."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointRegistration:
-    """Images in a common frame, by number; other fields are as in `Panorama`.
+    """Images in a common frame. The keys of the dictionaries are image numbers.
 
-    Homographies map to the frame of the first image, in the order in which images were connected.
-    `cameras` is None unless rotating cameras are requested.
+    `homographies` map to the frame of their first image, and are in the order in which images were
+    connected. `cameras` is None unless rotating cameras are requested. `matches`, `residual_px` and
+    `unregistered` are as in `Panorama`.
     """
 
     homographies: dict[int, np.ndarray]
@@ -70,7 +74,7 @@ class JointRegistration:
 
 
 class _Image(NamedTuple):
-    """An image with sparse keypoints and descriptors, and (N, 2) dense keypoints."""
+    """A grey image, its sparse keypoints with descriptors, and its (N, 2) dense keypoints."""
 
     gray: np.ndarray
     features: Keypoints
@@ -89,8 +93,8 @@ def register_images(
     """Find the homographies of overlapping images, (H, W, 3) uint8 RGB, to a common frame.
 
     SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
-    without heat map do both. The largest group of connected images is registered, or the group of
-    the image numbered `reference`. With `turning` rotating cameras are also estimated.
+    without heat map do both. The largest group of connected images is registered, or the group that
+    contains image number `reference`. If `turning`, cameras that only rotate are estimated as well.
     """
     done = progress or (lambda _: None)
     views = []
@@ -132,7 +136,7 @@ def register_images(
     if turning and residual_px > MAX_CAMERA_RESIDUAL_PX:
         raise RegistrationError(
             f"the cameras of these images did not only rotate ({residual_px:.1f} px remain): "
-            "take all from one place, or choose the projection 'plane'"
+            "take all images from one place, or choose the projection 'plane'"
         )
     counts = {(pair.first, pair.second): pair.matches for pair in pairs}
     return JointRegistration(homographies, cameras, counts, residual_px, unregistered)
@@ -187,7 +191,8 @@ def _registered_pairs(
         for _ in range(MAX_FURTHER_TRIALS):
             if pair is not None or geometry.matrix is None:
                 break
-            # With repeated structure (windows) most keypoints may agree on a wrong geometry.
+            # On repeated structure (windows), most keypoints may agree on a wrong geometry. So
+            # another is estimated from those that disagree with it.
             tentative = tentative.apart_from(geometry.matrix)
             geometry = estimate_initial_geometry(tentative, "homography", seed)
             pair = _register(views, first, second, geometry, seed)
@@ -201,7 +206,7 @@ def _registered_pairs(
 def _register(
     views: Sequence[_Image], first: int, second: int, geometry: InitialGeometry, seed: int
 ) -> RegisteredPair | None:
-    """Match densely guided by a geometry; return None if there is none or it is rejected."""
+    """Register a pair by dense matches guided by a geometry; return None if they reject it."""
     if geometry.matrix is None:
         return None
     a, b = views[first], views[second]
@@ -221,11 +226,12 @@ def _registered_again(
     pairs: Sequence[RegisteredPair],
     seed: int,
 ) -> list[RegisteredPair]:
-    """Register pairs again, starting from a fit, if they disagree with it or are missing in it.
+    """Register pairs again, starting from the joint fit, if they disagree with it or are missing.
 
-    With repeated or collinear structure (towers, windows) keypoints give wrong homographies, which
-    dense matches reject or confirm in part. The fit predicts them from all other pairs. The result
-    with more matches is returned. A full turn needs its closing pair, or its ends drift apart.
+    On repeated or collinear structure (windows, towers), keypoints can give a wrong homography,
+    which dense matches reject or confirm only in part. The joint fit predicts the homography of a
+    pair from all other pairs. The new result replaces the old one if it has more matches. A
+    panorama of 360 degrees needs the pair that closes it, or its ends drift apart.
     """
     known = {(pair.first, pair.second): pair for pair in pairs}
     partners: dict[int, set[int]] = {number: set() for number in to_common}
@@ -273,7 +279,7 @@ def _registered_again(
 
 
 def _shown(first: _Image, second: _Image, homography: np.ndarray) -> float:
-    """Return the fraction of an image's keypoints that a homography maps into another image."""
+    """Return the fraction of the first image's keypoints that a homography maps into the second."""
     x, y, depth = homography @ np.vstack([first.keypoints.T, np.ones(len(first.keypoints))])
     height, width = second.gray.shape
     inside = (x > 0) & (x < depth * (width - 1)) & (y > 0) & (y < depth * (height - 1))
@@ -292,7 +298,7 @@ def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
 
 
 def _compose(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
-    """Compose homographies along the maximum spanning tree, to the image with most matches."""
+    """Compose homographies along the maximum spanning tree, to the frame of one image."""
     tree: list[RegisteredPair] = []
     steps: list[tuple[int, int, np.ndarray]] = []
     matches = dict.fromkeys(group, 0)
