@@ -1,4 +1,4 @@
-"""Write a model in further file formats: point clouds and maps in UTM, meshes, inputs for splats."""
+"""Write a model in further formats: point clouds and maps in UTM, meshes, and inputs for splats."""
 
 from __future__ import annotations
 

@@ -47,8 +47,8 @@ MIN_TRIANGULATION_DEG = 1.0
 angle from that of the reference image. Chosen by hand."""
 
 DUPLICATE_DEPTH = 0.01
-"""A point is dropped if an earlier one projects to the same pixel and their depths differ by at most
-this fraction. Chosen by hand."""
+"""A point is dropped if an earlier one projects to the same pixel and their depths differ by at
+most this fraction. Chosen by hand."""
 
 DENSE_POINT = np.dtype(
     [
@@ -59,9 +59,9 @@ DENSE_POINT = np.dtype(
         ("views", np.uint8),
     ]
 )
-"""A dense point, which comes from a pixel of the depth map of a reference image. `normals` is a unit
-vector towards the camera of this image. `errors` is the `error` of the pixel (see `DEPTH_PIXEL`).
-`colors` is sRGB. `views` is the number of images that agree on the point."""
+"""A dense point, which comes from a pixel of the depth map of a reference image. `normals` is a
+unit vector towards the camera of this image. `errors` is the `error` of the pixel (see
+`DEPTH_PIXEL`). `colors` is sRGB. `views` is the number of images that agree on the point."""
 
 
 def fuse_depth_maps(
@@ -92,7 +92,7 @@ def fuse_depth_maps(
     xy, near = np.column_stack([column, row]) * float(stride_px), inverse[row, column]
     fused = np.empty(len(row), DENSE_POINT)
     fused["points"] = (camera.rays(xy) / near[:, None] - views[0].translation) @ views[0].rotation
-    # At a pixel, the inverse depth of a plane is (normal . line of sight) / (distance of the plane).
+    # The inverse depth of a plane at a pixel is (normal . line of sight) / (distance of the plane).
     ahead = near - (plane[:, 1:] * (xy - camera.centre)).sum(axis=1)
     away = np.column_stack([plane[:, 1:] * camera.focal_px, ahead]) @ views[0].rotation
     fused["normals"] = -away / np.linalg.norm(away, axis=1, keepdims=True)

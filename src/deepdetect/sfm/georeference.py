@@ -197,7 +197,7 @@ def require_images(
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
-    """Raise an OptionError if control points or ends of a distance do not name images in `names`.
+    """Raise an OptionError if control points or ends of a distance name images not in `names`.
 
     At least `MIN_FIXES` control points must each be marked in two or more of these images.
     """

@@ -170,7 +170,7 @@ def _matches(database: Any, number: int, other: int) -> np.ndarray:
 
 
 def _agreeing(camera: Any, xy: np.ndarray, points: np.ndarray, pose: Any) -> int:
-    """Count the `points` (K, 3) that a camera with this pose sees at their keypoints `xy` (K, 2)."""
+    """Count the points (K, 3) that a camera with this pose sees at their keypoints `xy` (K, 2)."""
     local = points @ pose.rotation.matrix().T + pose.translation
     errors = np.linalg.norm(camera.img_from_cam(local) - xy, axis=1)
     return int(((errors < MAX_VERIFICATION_ERROR_PX) & (local[:, 2] > 0)).sum())
