@@ -108,8 +108,8 @@ NOISE_LEVELS = 1.0
 hand."""
 
 JUMPS = (16, 8, 4, 2, 1)
-"""In each of five passes, pixels try the planes of pixels at this distance in the depth map. A
-plane can thus spread over 31 pixels."""
+"""Pixels try the planes of pixels at this distance in the depth map, one distance in each of five
+passes. A plane can thus spread over 31 pixels."""
 
 SURE_CORRELATION = 0.9
 """A pixel whose window correlates at least this well with other images keeps its plane, and does
@@ -128,9 +128,9 @@ MIN_WEIGHT = 0.02
 textured pixels exceeds 0.5."""
 
 MIN_VIEWS = 3
-"""At least this number of images must agree on the depth of a pixel, including the pixel's own
-image: a third image confirms the match of two. `fusion` asks for other numbers in some places, such
-as depth edges."""
+"""The depth of a pixel is kept only if at least this number of images agree on it, including the
+pixel's own: a third image confirms the match of two. `fusion` asks for other numbers in some
+places, such as depth edges."""
 
 DEPTH_PIXEL = np.dtype(
     [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True
@@ -333,7 +333,7 @@ def _refine(
         # The fit needs slopes per pixel of the depth map. All other code has them per image pixel.
         planes = _fit(np.dstack([refined, planes[..., 1:] * stride_px]), weights, radius, tolerance)
         planes[..., 1:] /= stride_px
-    # A window can have texture although its middle pixel has none, so the textured area is eroded.
+    # A window can have texture although its middle pixel does not, so the textured area is eroded.
     reach = np.ones((2 * -(-WINDOW_RADIUS_PX // stride_px) + 1,) * 2, np.uint8)
     textured = cv2.erode((sure | np.isnan(planes[..., 0])).astype(np.uint8), reach) > 0
     planes[~_enclosed(planes, textured, stride_px, tolerance)] = np.nan

@@ -27,19 +27,19 @@ If the point is in the frame of fewer images than that, all of them must agree, 
 least `MIN_ALL_VIEWS`. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
-"""Up to this distance from a depth edge, on its near side, only the strict rule holds, that of
-`MIN_ALL_VIEWS` and `ENOUGH_VIEWS`. There, matching windows give pixels of the background the depth
-of the foreground, in all images alike. Chosen by hand."""
+"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the strict rule
+of `MIN_ALL_VIEWS` and `ENOUGH_VIEWS`. There, matching windows give pixels of the background the
+depth of the foreground, in all images alike. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
-"""In the middle of a surface, `MIN_VIEWS` images are enough, because most wrong points are on small
-patches. A pixel is in the middle if, of 5 x 5 pixels around it that are `MIDDLE_SPACING_PX` apart,
-at least the fraction `MIN_MIDDLE_SHARE` lie on the same surface and are confirmed by `MIN_VIEWS`
-images. Chosen by hand."""
+"""Pixels in the middle of a surface need only `MIN_VIEWS` images that agree, because most wrong
+points are on small patches. The middle is tested with 5 x 5 pixels that are `MIDDLE_SPACING_PX`
+apart: at least the fraction `MIN_MIDDLE_SHARE` of them must lie on the surface, and `MIN_VIEWS`
+images must agree on each of these. Chosen by hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
-"""For a pixel within `FILLED_RADIUS_PX` of the middle of its surface (see `MIN_MIDDLE_SHARE`),
-`MIN_FILLED_VIEWS` images are enough, because other images may not show this part of the surface.
+"""Pixels within `FILLED_RADIUS_PX` of the middle of their surface (see `MIN_MIDDLE_SHARE`) need only
+`MIN_FILLED_VIEWS` images that agree, because other images may not show this part of the surface.
 Chosen by hand."""
 
 MIN_TRIANGULATION_DEG = 1.0

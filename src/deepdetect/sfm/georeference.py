@@ -28,8 +28,8 @@ CONTROL_ACCURACY_M = 0.1
 and marked in the images to within a few pixels."""
 
 MIN_FIXES = 3
-"""At least this number of positions must agree: with two, the rotation about the line through them
-would be undetermined."""
+"""The fit needs at least this number of positions that agree: with two, the rotation about the line
+through them would be undetermined."""
 
 MAX_SCALE_STD = 0.25
 """A model is georeferenced only if the relative standard deviation of its scale is below this. The
@@ -187,8 +187,8 @@ def require_fixes(folder: Path, what: str) -> None:
     found = sum(read_gps(path) is not None for path in find_images(folder))
     if found < MIN_FIXES:
         raise OptionError(
-            f"{what} needs {MIN_FIXES} images with a GPS position, and there are {found}: leave the "
-            "format out, or give ground control points"
+            f"{what} needs {MIN_FIXES} images with a GPS position, and there are {found}: leave "
+            "the format out, or give ground control points"
         )
 
 

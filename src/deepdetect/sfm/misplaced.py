@@ -36,8 +36,9 @@ MAX_ROUNDS = 3
 better points for checking the other images."""
 
 MIN_KEPT = 0.9
-"""After a correction, all points are triangulated again. The correction is undone if they have less
-than this fraction of the observations before. The fraction was 0.99 where a correction helped."""
+"""All points are triangulated again after a correction. The correction is undone if the new points
+have less than this fraction of the observations that the old ones had. The fraction was 0.99 where
+a correction helped."""
 
 
 def correct_places(

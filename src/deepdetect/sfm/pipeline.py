@@ -42,7 +42,7 @@ from .splat import write_transforms
 from .stages import WORK, MultiViewOptions, Stages, check_images
 
 MAX_KEYPOINTS = 8192
-"""By default, an image gets at most this number of keypoints. Chosen by hand."""
+"""An image gets at most this number of keypoints by default. Chosen by hand."""
 
 MIN_KEYPOINTS = 15
 """Images with fewer keypoints are left out, because they cannot be matched. Chosen by hand."""
@@ -78,8 +78,8 @@ def reconstruct_many(
         selection: which keypoints are kept, as in `extract_features`.
         calibration: known cameras, which are kept fixed: a calibration file, a `Calibration` or a
             `Camera`. By default, focal length and distortion are estimated.
-        focal_px: rough focal length of all images in pixels. By default it comes from EXIF or, if
-            EXIF has none, from a guess.
+        focal_px: rough focal length of all images in pixels. By default it comes from EXIF or,
+            without EXIF, from a guess.
         seed: seed of all random choices. Equal seeds may still give slightly different results,
             because of COLMAP's threads.
         options: options of all stages.

@@ -68,8 +68,8 @@ whatever their size."""
 class Surfaces(NamedTuple):
     """Small plane patches around pixels of an image, which are to be found in other images.
 
-    `pixels` (K, 2) are integers. `points` (K, 3) and `normals` (K, 3) are in the frame of the model.
-    Normals are unit vectors that point towards the camera of the image.
+    `pixels` (K, 2) are integers. `points` (K, 3) and `normals` (K, 3) are in the model's frame. The
+    normals are unit vectors that point towards the camera of the image.
     """
 
     pixels: np.ndarray
