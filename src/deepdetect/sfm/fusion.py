@@ -27,9 +27,9 @@ If the point is in the frame of fewer images than that, all of them must agree, 
 least `MIN_ALL_VIEWS`. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
-"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the strict rule
-of `MIN_ALL_VIEWS` and `ENOUGH_VIEWS`. There, matching windows give pixels of the background the
-depth of the foreground, in all images alike. Chosen by hand."""
+"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the strict
+rule of `MIN_ALL_VIEWS` and `ENOUGH_VIEWS`. There, matching windows give pixels of the background
+the depth of the foreground, in all images alike. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
 """Pixels in the middle of a surface need only `MIN_VIEWS` images that agree, because most wrong
@@ -38,9 +38,9 @@ apart: at least the fraction `MIN_MIDDLE_SHARE` of them must lie on the surface,
 images must agree on each of these. Chosen by hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
-"""Pixels within `FILLED_RADIUS_PX` of the middle of their surface (see `MIN_MIDDLE_SHARE`) need only
-`MIN_FILLED_VIEWS` images that agree, because other images may not show this part of the surface.
-Chosen by hand."""
+"""Pixels within `FILLED_RADIUS_PX` of the middle of their surface (see `MIN_MIDDLE_SHARE`) need
+only `MIN_FILLED_VIEWS` images that agree, because other images may not show this part of the
+surface. Chosen by hand."""
 
 MIN_TRIANGULATION_DEG = 1.0
 """A point is kept only if the line of sight of at least one image that agrees on it differs by this

@@ -305,7 +305,7 @@ def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> Non
 
 
 def adjust_refined(model: Any, known_cameras: bool) -> None:
-    """Bundle-adjust a model with refined tracks twice. Wrong observations are removed before each."""
+    """Bundle-adjust a model with refined tracks twice. Remove wrong observations before each."""
     for max_error_px, tolerance in (
         (MAX_VERIFICATION_ERROR_PX, ROUGH_TOLERANCE),
         (MAX_REFINED_ERROR_PX, TOLERANCE),

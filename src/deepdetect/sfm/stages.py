@@ -374,7 +374,7 @@ class Stages:
         return merge_dense_points(self.fused(folder, sparse), self.options.stride_px)
 
     def fused(self, folder: Path, sparse: SparseModel) -> Iterator[tuple[PosedView, np.ndarray]]:
-        """Yield each reference view with its dense points. Points of other views may repeat them."""
+        """Yield each reference view with its dense points. Other views may repeat its points."""
         store, stride = self.work / "dense", self.options.stride_px
         references = find_references(sparse)
         paths: dict[str, Path] = {}

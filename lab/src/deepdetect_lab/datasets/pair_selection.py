@@ -42,7 +42,7 @@ def sequence_pairs(
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """Return at most `count` evenly spaced items of a sequence, including the first and the last."""
+    """Return at most `count` evenly spaced items of a sequence, with the first and the last."""
     if len(items) <= count:
         return list(items)
     return [items[row] for row in np.linspace(0, len(items) - 1, count).round().astype(int)]

@@ -106,7 +106,7 @@ class Crop:
 
     @property
     def part(self) -> str:
-        """Part of the data set: "train" or "val". All crops of a photograph are in the same part."""
+        """Part of the data set: "train" or "val". All crops of a photograph are in one part."""
         return "val" if int(self.sha256[:8], 16) < VALIDATION_SHARE * 2**32 else "train"
 
 
