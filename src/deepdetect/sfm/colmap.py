@@ -1,8 +1,8 @@
 """Use COLMAP's camera models, and write its database, through pycolmap.
 
 The centre of the first pixel is (0.5, 0.5) in COLMAP and (0, 0) here, so half a pixel is added to
-positions for COLMAP. COLMAP stores the sigma of a keypoint, half of the diameter that OpenCV
-stores. Its orientations are in radians, OpenCV's in degrees. Both are clockwise.
+positions for COLMAP. As the scale of a keypoint, COLMAP stores sigma, half of the diameter that
+OpenCV stores. COLMAP's orientations are in radians, OpenCV's in degrees. Both are clockwise.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ..geometry.camera import Calibration, Camera
 from ..io.exif import camera_from_exif
 
 PIXEL_CENTRE = 0.5
-"""Both coordinates of the centre of the first pixel in COLMAP. In this package they are 0."""
+"""In COLMAP, the centre of the first pixel is (0.5, 0.5); in this package, it is (0, 0)."""
 
 SIFT_NUMBERS = 128
 
@@ -233,7 +233,7 @@ def write_database(
     The matches of a pair of images are (K, 2) indices of keypoints.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
-        cameras: dict[int, tuple[int, int]] = {}  # IDs of camera and rig
+        cameras: dict[int, tuple[int, int]] = {}  # camera ID and rig ID, by `id` of the intrinsics
         numbers: dict[str, int] = {}
         for name, (points, intrinsics) in images.items():
             if id(intrinsics) not in cameras:

@@ -56,9 +56,9 @@ def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost)
     """Write the matching cost of each pixel at each of D inverse depths, (H, W, D) uint8.
 
     At each pixel, the Hamming distances to the two neighbours that agree best are added. A cost is
-    an eighth of these sums over 3 x 3 pixels. `neighbours` (K, H', W') are censuses of neighbours
-    that are warped to the reference. In neighbour k, the pixel (x, y) at inverse depth number d is
-    at column `columns[k, d, x]` and row `rows[k, d, y]`.
+    the sum of these numbers over 3 x 3 pixels, divided by 8. `neighbours` (K, H', W') are the
+    censuses of neighbours, warped to the reference. In neighbour k, the pixel (x, y) at inverse
+    depth number d is at column `columns[k, d, x]` and row `rows[k, d, y]`.
     """
     height, width, count = cost.shape
     line = np.empty((count, width), np.uint8)
@@ -140,7 +140,7 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
             e, f = siv - si * sv / n, sjv - sj * sv / n
             area = a * c - b * b
             more_right = more_down = 0.0
-            if area > n:  # otherwise the pixels lie on a line
+            if area > n:  # else they lie on a line, and the slopes stay
                 more_right, more_down = (e * c - f * b) / area, (f * a - e * b) / area
             out[y, x, 0] = w + (sv - more_right * si - more_down * sj) / n
             out[y, x, 1] = right + more_right
@@ -161,7 +161,7 @@ def _project(m, x, y, w):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  # type: ignore[no-untyped-def]
-    """Compare the window around a pixel with its projection, by the plane, to a neighbour.
+    """Compare the window around a pixel with the window that its plane maps it to in a neighbour.
 
     Returns correlation, shift, parallax and weight. The correlation is -1 if the neighbour does not
     show the whole window. The shift, in pixels along the epipolar line, is one Lucas-Kanade step
@@ -249,12 +249,12 @@ def propagate_rows(  # type: ignore[no-untyped-def]
     first, last, planes, scores, jump, sure, stride, gray, neighbours, sizes, maps, radius, spacing,
     noise, out, found,
 ):  # fmt: skip
-    """Try the planes of four other pixels at each pixel that correlates worse than `sure`.
+    """Let each pixel that correlates worse than `sure` try the planes of four other pixels.
 
-    The four pixels are `jump` pixels to the right, to the left, below and above. The pixel takes
-    the plane that correlates best there, or keeps its own. With a `jump` of 0, it only gets the
-    correlation of its own plane. `scores` (H, W) are the correlations of the given planes, `found`
-    those of the new planes. `refine_rows` describes the other arguments.
+    The others are `jump` pixels to the right, to the left, below and above. The pixel takes the
+    plane with which its window correlates best, or keeps its own. With a `jump` of 0, only the
+    correlation of its own plane is computed. `scores` (H, W) are the correlations of the given
+    planes, `found` those of the new planes. `refine_rows` describes the other arguments.
     """
     height, width = gray.shape
     rows, columns = planes.shape[:2]

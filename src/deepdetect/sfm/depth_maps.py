@@ -26,12 +26,10 @@ from .colmap import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel
 
 MATCHED_NEIGHBOURS = 4
-"""An image is matched with at most this number of neighbours, because each of them takes time.
-Chosen by hand."""
+"""An image is matched with up to this number of neighbours; each takes time. Chosen by hand."""
 
 NEIGHBOURS = 8
-"""The depth map of an image is compared with those of at most this number of neighbours. Chosen by
-hand."""
+"""A depth map is compared with those of at most this number of neighbours. Chosen by hand."""
 
 MIN_COMMON_POINTS = 30
 """A neighbour must share at least this number of sparse points with the image. Chosen by hand."""
@@ -48,12 +46,11 @@ MAX_SIDE_PX = 2000
 """Images whose longer side exceeds this are scaled down to it, which limits time and memory."""
 
 CACHED_IMAGES = 16
-"""Each process caches this number of undistorted images, because successive images share
-neighbours."""
+"""A process caches this number of undistorted images: successive images share neighbours."""
 
 SMALL_SCALE = 0.5
-"""Images are scaled down at least by this factor for semi-global matching. Halving the factor
-divides the time by eight."""
+"""Images are scaled by at most this factor for semi-global matching. Halving the factor divides the
+time by eight."""
 
 MAX_VOLUME = 3e7
 """Images are scaled down further for semi-global matching if their number of pixels, times the
@@ -65,26 +62,25 @@ ignored at each end, because these may be wrong. The range is then extended at e
 `DEPTH_MARGIN` times its length. Chosen by hand."""
 
 MIN_FAR = 0.1
-"""The far end of the search range is at least this fraction of the smallest inverse depth of the
-sparse points, so it stays above 0. Chosen by hand."""
+"""The smallest inverse depth that is searched is at least this fraction of the smallest one of the
+sparse points, so that it stays above 0. Chosen by hand."""
 
 MAX_APPROACH = 0.5
-"""Images are first aligned at one depth, which must lie ahead of all cameras. It is chosen so that
-the camera farthest ahead of the first one is at most this fraction of the depth ahead. Chosen by
-hand."""
+"""The search first aligns all images at one depth of the first image, which must lie ahead of all
+cameras. A camera ahead of the first one has covered at most this fraction of the way to that depth.
+Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
-"""One step of inverse depth in the search should move a match by one pixel. Matches move
-differently, so the step suits this quantile of their motions. It is the median and not the minimum,
-because matches near the epipole hardly move."""
+"""One step of inverse depth in the search should move a match by one pixel. Some matches move more
+than others, so this quantile of the motions over the image is used. It is the median, because
+matches near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
 """Two inverse depths belong to different surfaces if their matches are farther apart than this in
 the downscaled images of the search."""
 
 FIT_RADIUS_PX = 3
-"""Planes are fitted to the depth map of the downscaled image in windows of this radius. Chosen by
-hand."""
+"""Planes are fitted to the downscaled depth map in windows of this radius. Chosen by hand."""
 
 FIT_TOLERANCES_PX = (4, 2, 1)
 """Planes are fitted three times, each time to the inverse depths within this tolerance of the
@@ -92,8 +88,7 @@ current plane, in steps of the search. The first planes are frontal. The first t
 that the fit can turn them into steep surfaces such as the ground. Chosen by hand."""
 
 MIN_FITTED = 12
-"""A plane must fit at least this number of pixels, because smaller isolated patches are wrong.
-Chosen by hand."""
+"""A plane must fit at least this number of pixels: smaller patches are wrong. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
 """Windows that reach `WINDOW_RADIUS_PX` to each side of a pixel are compared. Only pixels
@@ -104,8 +99,7 @@ BLUR_SIGMA_PX = 1.0
 window are read, and after the blur they represent the others."""
 
 NOISE_LEVELS = 1.0
-"""Assumed noise of a pixel, in grey levels. Weaker gradients do not move a depth. Chosen by
-hand."""
+"""Assumed noise of a pixel in grey levels: weaker gradients move no depth. Chosen by hand."""
 
 JUMPS = (16, 8, 4, 2, 1)
 """Pixels try the planes of pixels at this distance in the depth map, one distance in each of five
@@ -116,16 +110,15 @@ SURE_CORRELATION = 0.9
 not try those of other pixels, which saves time. Chosen by hand."""
 
 MIN_CORRELATION = 0.5
-"""A neighbouring image refines the depth of a pixel only if their windows correlate at least this
-well. Chosen by hand."""
+"""A neighbour refines a depth only if the windows correlate at least this well. Chosen by hand."""
 
 SMOOTHING_RADII = (4, 3)
-"""Planes are refined twice. After each time they are smoothed: planes are fitted again in windows
-of this radius, in pixels of the depth map. Chosen by hand."""
+"""Planes are refined twice. After each refinement they are smoothed by a fit in windows of this
+radius, in pixels of the depth map. Chosen by hand."""
 
 MIN_WEIGHT = 0.02
-"""Weight in the smoothing of a pixel without texture. For comparison, the weight of half of the
-textured pixels exceeds 0.5."""
+"""Weight of a pixel without texture when planes are smoothed. Half of the textured pixels have
+weights above 0.5."""
 
 MIN_VIEWS = 3
 """The depth of a pixel is kept only if at least this number of images agree on it, including the
@@ -300,10 +293,7 @@ def _refine(
     stride_px: int,
     step: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine planes (H, W, 3) by matching the full-size images.
-
-    Returns the planes, NaN where the depth is unknown, and the errors (H, W) of `DEPTH_PIXEL`.
-    """
+    """Refine planes (H, W, 3) by matching full-size images; also return their errors in pixels."""
     from .dense_kernels import propagate_rows, refine_rows
 
     blurred = [cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_SIGMA_PX) for gray in grays]
@@ -359,10 +349,7 @@ def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: f
 
 
 def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return a mask of `known` pixels and of those below them on the same surface.
-
-    `begins` marks pixels at which a new surface begins, downwards.
-    """
+    """Return a mask of `known` pixels and of those below them, until a new surface `begins`."""
     rows = np.arange(len(known))[:, None]
     last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
     return last >= first
@@ -380,10 +367,7 @@ def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray
 def relative_projections(
     first: PosedView, others: Sequence[PosedView], back: bool = False
 ) -> np.ndarray:
-    """Return A and b of `relative_projection` side by side, (K, 3, 4), for K other views.
-
-    They project from the first view to the others or, with `back`, from the others to the first.
-    """
+    """Return A and b side by side, (K, 3, 4), from the first view to K others (`back`: to it)."""
     pairs = [(other, first) if back else (first, other) for other in others]
     return np.array([np.column_stack(relative_projection(*pair)) for pair in pairs])
 
@@ -413,10 +397,7 @@ def prepared_image(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, Po
 def _undistorted(
     path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, camera: Camera
 ) -> np.ndarray:
-    """Read and undistort an image.
-
-    `state` is only for the cache: a changed file has another state, so it is read again.
-    """
+    """Read and undistort an image. A changed file has another `state`, so the cache misses it."""
     rgb = load_image(path, max_megapixels=np.inf)
     if camera.size != intrinsics.size:
         rgb = cv2.resize(rgb, camera.size, interpolation=cv2.INTER_AREA)

@@ -29,8 +29,8 @@ LAZ_STEP_M = 0.001
 """Coordinates in LAZ files are rounded to multiples of this, in metres."""
 
 MESH_MARGIN = 0.5
-"""A mesh is made only of points inside the robust bounding box, which is extended on each side by
-this fraction of its size."""
+"""Meshing uses only points inside the robust bounding box, extended on each side by this fraction
+of its size."""
 
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
 """The octree of a mesh gets deeper with the number of points, between the two depths. Where points
@@ -38,14 +38,12 @@ are sparse, the octree is coarser than its full depth: by more than `MESH_TRIM` 
 is cut away. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
-"""A mesh needs at least this number of points, because with a handful COLMAP's meshing crashes the
-process."""
+"""A mesh needs this number of points: with only a handful, COLMAP's meshing crashes the process."""
 
 COLORS = ("red", "green", "blue")
 
 POINTS_PER_CELL = 4.0
-"""The cell size of a map is chosen so that cells hold this number of points on average. Few cells
-then stay empty. Chosen by hand."""
+"""Cells of a map hold this number of points on average, so that few stay empty. Chosen by hand."""
 
 MAX_MAP_SIDE = 10_000
 """A map has at most this number of rows and columns, which limits the memory and the file size."""

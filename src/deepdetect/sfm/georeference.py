@@ -220,7 +220,9 @@ def georeference_by_gps(
     """
     fixes = {name: fix for name in views if (fix := read_gps(folder / name)) is not None}
     if len(fixes) < MIN_FIXES:
-        raise ReconstructionError(f"{len(fixes)} images have GPS, but {MIN_FIXES} are needed")
+        raise ReconstructionError(
+            f"{len(fixes)} of the images have GPS, but {MIN_FIXES} are needed"
+        )
     places = np.array([(fix.latitude, fix.longitude, fix.altitude) for fix in fixes.values()])
     stated = [fix.accuracy_m for fix in fixes.values() if fix.accuracy_m is not None]
     accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M

@@ -43,8 +43,7 @@ MAX_MODELS = 5
 each to a model of its own. Chosen by hand."""
 
 MAX_FIRST_PAIRS = 20
-"""The mapping of a component begins with a pair of images, and tries at most this number of pairs.
-Chosen by hand."""
+"""The mapping tries at most this number of pairs of images to begin with. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
 """The mapping begins with a pair of images. In the first attempt, their lines of sight must form
@@ -53,8 +52,7 @@ for this angle, and allows such motion. It follows if the first finds no pair, a
 car, or leaves out more connected images than it maps. Chosen by hand."""
 
 ROBUST_SCALE_PX = 1.0
-"""Scale of the Cauchy loss in bundle adjustment: larger reprojection errors count less. Chosen by
-hand."""
+"""Scale of the Cauchy loss in bundle adjustment: larger errors count less. Chosen by hand."""
 
 MAX_REFINED_ERROR_PX = 1.0
 """Observations of refined tracks with a larger reprojection error are removed, because such a patch

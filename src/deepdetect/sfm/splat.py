@@ -20,8 +20,7 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .result import MultiViewReconstruction
 
 SPLAT_POINTS = 200_000
-"""Training starts from at most this number of dense points, to which trainers add more. Chosen by
-hand."""
+"""Training starts from at most this number of dense points. Trainers add more. Chosen by hand."""
 
 JPEG_QUALITY = 95
 

@@ -57,8 +57,7 @@ from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
-"""If `pairs` is "auto", all pairs are matched if there are at most this number of images. Chosen by
-hand."""
+"""With `pairs="auto"`, all pairs of up to this number of images are matched. Chosen by hand."""
 
 WORK = "work"
 """Name of the folder of intermediate results, inside the output folder."""

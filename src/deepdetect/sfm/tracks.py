@@ -29,8 +29,7 @@ PATCH_RADIUS_PX = 6
 """Radius of the patches that are aligned. Chosen by hand."""
 
 MAX_SHIFT_PX = 2.5
-"""The alignment may move a patch by at most this distance from the projection of its point. Chosen
-by hand."""
+"""Alignment moves a patch at most this far from the projection of its point. Chosen by hand."""
 
 BLUR_SIGMA_PX = 0.7
 """Images are blurred with this sigma before patches are aligned. Without the blur, cubic

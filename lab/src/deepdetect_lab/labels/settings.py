@@ -66,7 +66,7 @@ class LabelOptions:
             )
 
     def with_detectors(self, names: tuple[str, ...]) -> LabelOptions:
-        """Return options with other detectors. The settings of detectors not in `names` are lost."""
+        """Return options with other detectors. Settings of detectors not in `names` are dropped."""
         kept = {name: self.settings[name] for name in self.settings if name in names}
         return replace(self, detectors=names, settings=kept)
 
