@@ -26,7 +26,7 @@ from ..geometry.camera import Calibration, Camera
 from ..io.exif import camera_from_exif
 
 PIXEL_CENTRE = 0.5
-"""In COLMAP, the centre of the first pixel is (0.5, 0.5); in this package, it is (0, 0)."""
+"""COLMAP has the centre of the first pixel at (0.5, 0.5), this package at (0, 0)."""
 
 SIFT_NUMBERS = 128
 

@@ -415,7 +415,8 @@ def support_rows(first, last, planes, stride, chosen, reach, spacing, tolerance,
     The pixels around it are every `spacing`-th one, in both directions, of a square that reaches
     `reach` pixels to each side. They include the pixel itself, but none outside the map. `chosen`
     (H, W) is a mask, and `planes` are as in `fuse_rows`. A pixel is on the surface if its inverse
-    depth differs from the plane of the middle pixel by at most `tolerance` times the middle one's.
+    depth differs from the middle pixel's plane by at most `tolerance` times the inverse depth of
+    the middle pixel.
     """
     height, width = chosen.shape
     for row in range(first, last):

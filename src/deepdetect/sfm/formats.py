@@ -33,9 +33,9 @@ MESH_MARGIN = 0.5
 of its size."""
 
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
-"""The octree of a mesh gets deeper with the number of points, between the two depths. Where points
-are sparse, the octree is coarser than its full depth: by more than `MESH_TRIM` levels, the surface
-is cut away. Chosen by hand."""
+"""The depth of a mesh's octree grows with the number of points, between the two `MESH_DEPTHS`.
+Where points are sparse, the octree is coarser. Where it is more than `MESH_TRIM` levels above its
+full depth, the surface is cut away. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
 """A mesh needs this number of points: with only a handful, COLMAP's meshing crashes the process."""

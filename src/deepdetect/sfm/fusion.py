@@ -14,8 +14,8 @@ from ..geometry.camera import PosedView
 from .depth_maps import MIN_VIEWS, relative_projections
 
 MAX_ERROR_PX = 1.0
-"""A neighbour's depth map agrees on a pixel if its surface reprojects to within this distance of
-the pixel. Chosen by hand; COLMAP's fusion allows 2 px."""
+"""The depth map of a neighbour agrees with the depth of a pixel if the point of its own surface
+reprojects to within this distance of the pixel. Chosen by hand; COLMAP's fusion allows 2 px."""
 
 MAX_DEPTH_DIFFERENCE = 0.01
 """Two inverse depths agree, or belong to one surface, if they differ by at most this fraction.

@@ -282,7 +282,7 @@ def upright(
             level += [*np.linalg.svd(down[-1][None])[2][1:]]
             stds += 2 * [GRAVITY_STD_DEG]
         else:
-            # All cameras may be tilted alike: their mean tilt is no more certain if there are more.
+            # All cameras may be tilted alike, so more of them do not make the mean more certain.
             level += [view.rotation[0], view.rotation[2]]
             stds += [UPRIGHT_STD_DEG, AHEAD_STD_DEG * np.sqrt(len(views))]
     up = -np.mean(down, axis=0) if down else np.zeros(3)
@@ -331,10 +331,11 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
             rows.append(ControlRow((name or [f"{x} {y} {z}"])[0], place, image, xy))
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # of pyproj, or text where numbers should be
+    except Exception as error:  # an error of pyproj, or text in place of numbers
         raise OptionError(
-            f"{path} is not a file of ground control points ({first_line(error)}): its first line "
-            "must be the coordinate system, such as EPSG:32633, each other x y z column row image"
+            f"{path} is not a file of ground control points ({first_line(error)}): the first line "
+            "must be the coordinate system, such as EPSG:32633, and each other line 'x y z column "
+            "row image'"
         ) from None
     return rows
 

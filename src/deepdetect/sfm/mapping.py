@@ -28,7 +28,7 @@ COLMAP also needs 30 inliers to register an image. Some 20 of 8,192 keypoints ag
 wrong pairs slow the mapping down tenfold."""
 
 MAX_VERIFICATION_ERROR_PX = 4.0
-"""A match is an inlier if its error is at most this, which is COLMAP's default."""
+"""A match is an inlier if its geometric error is at most this, which is COLMAP's default."""
 
 MAX_TRIALS = 5000
 """RANSAC draws at most this number of samples for a pair of images. COLMAP's limit is 10,000, and
@@ -46,10 +46,11 @@ MAX_FIRST_PAIRS = 20
 """The mapping tries at most this number of pairs of images to begin with. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
-"""The mapping begins with a pair of images. In the first attempt, their lines of sight must form
-COLMAP's 16 degrees, and the camera must not have moved straight ahead. A second attempt asks only
-for this angle, and allows such motion. It follows if the first finds no pair, as in a clip from a
-car, or leaves out more connected images than it maps. Chosen by hand."""
+"""The mapping begins with a pair of images. In the first attempt, lines of sight to a point must
+form an angle of 16 degrees, as COLMAP asks, and the camera must not have moved straight ahead. The
+second attempt asks only for this angle, and allows such motion. It follows if the first one finds
+no pair, as in a clip from a car, or leaves out more connected images than it maps. Chosen by
+hand."""
 
 ROBUST_SCALE_PX = 1.0
 """Scale of the Cauchy loss in bundle adjustment: larger errors count less. Chosen by hand."""
@@ -162,7 +163,7 @@ def map_images(
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
-            how.max_focal_length_ratio = np.inf  # COLMAP's is too low for telescopes
+            how.max_focal_length_ratio = np.inf  # COLMAP's limit is too low for telescopes
         found, tried = list[Any](), list[Any]()
         for forward in (False, True):
             if forward:
@@ -181,8 +182,8 @@ def map_images(
             attempt = _sound(models, known_cameras)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
-            # The images left out may form a larger component, for example a drive, if the folder
-            # also holds photographs of a house.
+            # The images left out may form a larger component. A folder may, for example, hold a
+            # clip of a drive and photographs of a house.
             mapped = frozenset[str]().union(*map(_names, found))
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
             if found and largest_component(left) <= _size(found[0]):
@@ -234,8 +235,8 @@ def _largest(found: Sequence[Any], tried: Sequence[Any]) -> tuple[Any, list[froz
         )
     if not found or _size(found[0]) < MIN_VIEWS:
         raise NoDepthError(
-            "the images do not overlap enough to be connected: take each from a new place, from "
-            "which it still shows most of what the image before it shows"
+            "the images do not overlap enough to be connected: take each image from a new place, "
+            "but so that it shows most of what the previous image shows"
         )
     return found[0], [_names(model) for model in found[1:]]
 

@@ -14,7 +14,7 @@ matched, counted in the image that has fewer keypoints. Chosen by hand."""
 
 
 def largest_component(pairs: Sequence[Pair]) -> int:
-    """Return the number of images in the largest component that pairs of images connect."""
+    """Return the number of images in the largest group that pairs connect, directly or not."""
     components: list[set[str]] = []
     for pair in pairs:
         touched = [names for names in components if not names.isdisjoint(pair)]
@@ -43,8 +43,8 @@ def thin_out(
     Args:
         names: all images in order.
         near: pairs of images that show nearly the same, with the motion between them in pixels.
-        dropped: images left out by earlier calls, each with the image kept in its place. The images
-            kept then are kept again.
+        dropped: images left out by earlier calls, each with the image that was kept in its place.
+            The images kept then are also kept in this call.
     """
     partners: dict[str, dict[str, float]] = {name: {} for name in names}
     for (first, second), distance in near.items():

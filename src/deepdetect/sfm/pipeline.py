@@ -93,8 +93,8 @@ def reconstruct_many(
     Raises:
         ImageError: the folder is missing or holds no image.
         OptionError: an option is unknown or out of range, or differs from that of an earlier run.
-        ReconstructionError: fewer than three images can be used. If three images cannot be
-            connected by matches, the error is of the subclass `NoDepthError`.
+        ReconstructionError: fewer than three images can be used. Its subclass `NoDepthError` means
+            that the images do not overlap enough, or do not determine depth.
         MissingExtraError: pycolmap or h5py is not installed.
 
     Example:
@@ -124,7 +124,8 @@ def reconstruct_many(
         del sizes[name]
     if alike and len(sizes) < MIN_VIEWS:
         raise NoDepthError(
-            f"only {len(sizes)} images differ, the others show nearly the same: move the camera"
+            f"only {len(sizes)} images differ, and the others show nearly the same as these: move "
+            "the camera"
         )
     intrinsics = initial_intrinsics(folder, sizes, known, focal_px, options.single_camera)
     with timer.stage("mapping"):

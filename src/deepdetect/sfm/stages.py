@@ -57,7 +57,7 @@ from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
-"""With `pairs="auto"`, all pairs of up to this number of images are matched. Chosen by hand."""
+"""The choice "auto" matches all pairs of images if there are at most this many. Chosen by hand."""
 
 WORK = "work"
 """Name of the folder of intermediate results, inside the output folder."""
@@ -76,18 +76,18 @@ class MultiViewOptions:
         pairs: pairs of images to match: "exhaustive" (all pairs), "sequential:10" (each image with
             the 10 that follow it by name), "similar:20" (with the 20 most similar ones), or "auto"
             (exhaustive for up to 50 images, else similar:20).
-        min_motion: leave out an image, like most frames of a video, if half of its matched
-            keypoints are less than this fraction of the longer side away from where they are in an
-            earlier image. None uses all images.
-        matches: "sparse" (only keypoints become points of the sparse model) or "dense" (points of
-            the depth maps also do, and cameras are adjusted to all of them).
+        min_motion: leave out an image if the median motion of its matched keypoints, relative to an
+            earlier image, is below this fraction of the longer side, as in most frames of a video.
+            None uses all images.
+        matches: "sparse" (the points of the sparse model come from keypoints only) or "dense" (they
+            also come from depth maps, and the cameras are adjusted to all of them).
         mapper: how COLMAP estimates the poses: "incremental" (one image after the other) or
             "global" (all at once, which saves time only for a thousand images or more).
         dense: compute dense points.
         stride_px: try every N-th pixel of every N-th row as a dense point.
-        single_camera: whether all images of one size were taken by one camera, or each by its own.
-            By default, images of one size share a camera if EXIF gives them the same focal length,
-            or gives none of them a focal length.
+        single_camera: whether all images of one size share a camera, or each image has its own. By
+            default, images of one size share a camera if EXIF gives them the same focal length, or
+            gives none.
         control_points: file of ground control points in the format of OpenDroneMap's gcp_list.txt;
             they replace the GPS of the images.
         scale_by: a known length in metres and its two ends. An end is an image, which stands for
@@ -270,8 +270,8 @@ class Stages:
     def match(self, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
         """Match pairs of images; return (K, 2) indices of keypoints for each pair.
 
-        Matches are filtered by comparing each with neighbouring matches. If the keypoints lack
-        sizes or angles, or their descriptors do not suit this filter, the ratio test is used.
+        Matches are filtered by comparing each with neighbouring matches. The ratio test is used
+        instead if the keypoints lack sizes or angles, or their descriptors do not suit the filter.
         """
         path = self.work / "matches.h5"
         first = first_keypoints(self.features)

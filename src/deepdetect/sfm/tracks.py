@@ -181,8 +181,8 @@ class _Tracks:
         """Align patches of an image in other images, and turn them into points with tracks.
 
         A patch becomes a point if it is found in at least `min_views` images, including its own.
-        `tracks` (K,) are indices of the model's points, one for each patch: the patch is searched
-        for only in images that see this point. If `tracks` is None, all images are searched.
+        Only images with `MIN_COMMON_POINTS` are searched. With `tracks` (K,), indices of the
+        model's points for each patch, a patch is searched for only in images that see its point.
         """
         own = self.numbers[name]
         pixels, points, _ = wanted

@@ -17,8 +17,8 @@ from deepdetect._shared.image_array import srgb_to_linear
 from deepdetect._shared.opencv import cv2
 
 FULL_WELL = 10_000.0
-"""A white pixel in full light collects this mean number of electrons in each colour. The number
-follows a Poisson distribution, which gives the shot noise. Chosen by hand; not measured."""
+"""A white pixel in full light collects this number of electrons in each colour, on average. Actual
+numbers follow a Poisson distribution, which is the shot noise. Chosen by hand; not measured."""
 
 READ_NOISE = 3.0
 """Standard deviation of the Gaussian read noise, in electrons. Chosen by hand; not measured."""

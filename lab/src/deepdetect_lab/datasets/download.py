@@ -51,7 +51,7 @@ class RemoteFile:
             set are checked.
         into: where the file belongs in the data set: for an archive, the folder to unpack it into;
             for any other file, its path.
-        inside: folder inside the archive whose contents are moved up into `into`.
+        inside: folder inside the archive, if any, whose contents are moved up into `into`.
         suffixes: endings of the files to unpack from a tar archive; empty for all files.
     """
 
@@ -78,8 +78,8 @@ class RemoteDataset:
         files: archives to unpack, and single files.
         images: number of images.
         licence: the terms of use.
-        contents: digests of files, made by `content_digest`, by their path in the data set. They do
-            not depend on the archive or the image format.
+        contents: digests of files (see `content_digest`), by path of the file in the data set. The
+            digests do not depend on the archive or the image format.
         texts: contents of text files to write, by path in the data set.
         prepare: function that converts the unpacked files in a folder to the data set. Its second
             argument says whether progress bars are off.
@@ -222,7 +222,7 @@ def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
     have = file_state(part)[0]
     headers = {"Range": f"bytes={have}-"} if have else {}
     with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_SECONDS) as response:
-        if response.status_code == 416:  # no bytes are left; the checksum decides
+        if response.status_code == 416:  # the file is complete; `download` checks it
             if file.checksum is None:
                 part.unlink()
                 raise requests.ConnectionError("the partial file belongs to another file")

@@ -73,7 +73,7 @@ class PlanarScene:
         return [self.pairs[0].first, *(pair.second for pair in self.pairs)]
 
     def with_max_pairs(self, max_pairs: int) -> PlanarScene:
-        """Return the scene with at most `max_pairs` evenly spaced pairs. One is the last pair."""
+        """Return the scene with at most `max_pairs` evenly spaced pairs. If 1, it is the last."""
         kept = self.pairs[-1:] if max_pairs == 1 else evenly_spaced(self.pairs, max_pairs)
         return replace(self, pairs=tuple(kept))
 
@@ -143,10 +143,10 @@ def _load_scene(
     layout: str,
     kind: str = "",
 ) -> PlanarScene:
-    """List images PREFIX1, PREFIX2, ... and read the homographies from the first to each other.
+    """List images PREFIX1, PREFIX2, ... and read homographies from the first to each other image.
 
-    The suffixes of an image are tried in the given order. `layout` says what the folder must hold,
-    for error messages.
+    For each image, the suffixes are tried in the given order. `layout` is the part of error
+    messages that says what the folder must hold.
     """
     files = []
     for number in range(1, len(homographies) + 2):

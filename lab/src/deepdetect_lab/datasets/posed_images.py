@@ -2,8 +2,8 @@
 
 - Strecha et al. (2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
 - KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt or K.txt, and with
-  poses.txt. The first line of calib.txt is the projection matrix of the camera. K.txt is its
-  camera matrix. Line N of poses.txt belongs to image N.
+  poses.txt. The first line of calib.txt holds the projection matrix of the camera. K.txt holds its
+  camera matrix. Line 1 of poses.txt belongs to image 000000.
 - COLMAP (Schönberger and Frahm, 2016): a text or binary model without distortion in the folder, in
   sparse/ or in sparse/0/, and images in the folder or in images/. pycolmap reads the model.
 
@@ -223,8 +223,8 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
         axes, centre = pose[:, :3], pose[:, 3]
         image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
         _image_size(path)  # raises an error if the image is damaged or has an EXIF rotation
-        # The poses are those of KITTI's first camera. The last column of the projection matrix
-        # gives the offset from it of the camera that took the images.
+        # The poses are those of KITTI's first camera, but another one may have taken the images.
+        # The last column of the projection matrix gives the offset between the two.
         offset = np.linalg.solve(image.intrinsics, projection[:, 3])
         images.append(replace(image, translation=image.translation + offset))
     return images
@@ -240,7 +240,11 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
     place = _colmap_model(folder) or folder
     try:
         model = import_pycolmap("COLMAP's model").Reconstruction(place)
-    except (ValueError, IndexError, RuntimeError) as error:  # which one depends on the damage
+    except (
+        ValueError,
+        IndexError,
+        RuntimeError,
+    ) as error:  # the type of error depends on the damage
         raise ImageError(
             f"{place} has no model that pycolmap can read ({first_line(error)}): write cameras, "
             "images and points3D with COLMAP"
@@ -290,7 +294,7 @@ def _posed_image(
     """Check the camera of an image, and return the image with its camera."""
     wrong = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if wrong > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
-        raise ImageError(f"{where} has no valid rotation: the columns of one are orthonormal")
+        raise ImageError(f"{where} has no valid rotation matrix: its columns must be orthonormal")
     lower = [intrinsics[1, 0], intrinsics[2, 0], intrinsics[2, 1], intrinsics[2, 2] - 1]
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or np.any(lower):
         raise ImageError(

@@ -111,10 +111,9 @@ def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _brisk_detector(threshold: int, octaves: int) -> cv2.Feature2D:
-    """Make a BRISK detector, or return the cached one.
+    """Make a BRISK detector, or return the one made for earlier images.
 
-    Without the cache, computing the sampling pattern would take as long as detection in a dark
-    image.
+    In a dark image, computing its sampling pattern would take as long as detection.
     """
     return opencv_factory("BRISK_create")(thresh=threshold, octaves=octaves)
 
@@ -177,7 +176,7 @@ def _canny(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 
 def _sobel(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """Detect thick edges: mark gradients, of a wide filter, above a fraction of the largest one."""
+    """Detect thick edges: mark wide Sobel gradients above a fraction of the largest gradient."""
     dx = cv2.Sobel(gray, cv2.CV_64F, 1, 0, ksize=settings["kernel_size"])
     dy = cv2.Sobel(gray, cv2.CV_64F, 0, 1, ksize=settings["kernel_size"])
     magnitude = cv2.magnitude(dx, dy)

@@ -29,8 +29,8 @@ class DilatedConvolution(nn.Module):
     """A dilated 3x3 convolution, which computes in float32 on the CPU even under autocast.
 
     On the CPU, in bfloat16 and with channels_last, PyTorch 2.13 returns NaN or wrong gradients for
-    dilated convolutions. Own code for the gradients, instead of float32, would make a training step
-    only 7 % faster.
+    dilated convolutions. With our own code for the gradients, in place of float32, a training step
+    was only 7 % faster.
     """
 
     def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
@@ -67,8 +67,8 @@ class SpatialPyramid(nn.Module):
     def branches(self, x: Tensor) -> Tensor:
         """Return the concatenated branches, partly summed.
 
-        From dilation 4 on, a branch is first added to all branches from dilation 2 to the one
-        before it.
+        From dilation 4 on, a branch is replaced by the sum of the branches from dilation 2 up to
+        itself.
         """
         reduced = self.c1(x)
         parts = [self.d1(reduced)]

@@ -44,7 +44,7 @@ def to_onnx(
     axes: Mapping[str, Mapping[int, str]],
     training: Any = torch.onnx.TrainingMode.EVAL,
 ) -> onnx.ModelProto:
-    """Convert a network to ONNX by tracing it with the example `inputs`, which are by name.
+    """Convert a network to ONNX by tracing it with example `inputs`, which are given by name.
 
     `axes` names the axes of variable size, by input or output and by number of the axis.
     """
@@ -67,7 +67,7 @@ def to_onnx(
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
-    """Write a network that predicts heat maps to an ONNX file, which accepts any image size."""
+    """Write a network that predicts heat maps, atomically, to an ONNX file for any image size."""
     # The name "network" becomes part of all node names, on which `tiling` relies.
     module = nn.Sequential(OrderedDict(network=network))
     axes = {0: "batch", 2: "height", 3: "width"}

@@ -125,12 +125,12 @@ class FastNetwork(nn.Module):
         self.logits = nn.Conv2d(HALF, 4, 1)
         nn.init.constant_(
             self.get_parameter("logits.bias"), -1.0
-        )  # about the logit of the fraction of pixels that labels mark
+        )  # about the logit of the fraction of pixels that a label marks
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""
-        # Autocast would round the luma. But a single grey level matters, because the smallest
-        # thresholds of detectors are that low.
+        # Autocast would round the luma. But a difference of one grey level matters, because it is
+        # the smallest threshold of the label detectors.
         with torch.autocast(image.device.type, enabled=False):
             luma = self.luma(image)
             exposure, mean = self.exposure(luma)

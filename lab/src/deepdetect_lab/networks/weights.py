@@ -19,8 +19,8 @@ from .espnet import ESPNet
 from .fast import FastNetwork
 
 NETWORKS: dict[str, type[nn.Module]] = {"espnet": ESPNet, "fast": FastNetwork}
-"""Classes of networks by name. They are made without arguments, and a network maps (B, 3, H, W)
-float32 RGB in [0, 1] to (B, 1, H, W) logits.
+"""Classes of networks by name. A network is made without arguments, and maps (B, 3, H, W) float32
+RGB in [0, 1] to (B, 1, H, W) logits.
 
 H and W are multiples of `STRIDE`. To add a network, write a module in this package and add it here.
 """
@@ -51,8 +51,8 @@ def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[st
 def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
     """Load a network from a weights file, in evaluation mode.
 
-    The class of the network is found by itself: it is the one of `kinds` (default: `NETWORKS`) that
-    has most tensor names in common with the file.
+    The class of the network is the one of `kinds` (default: all of `NETWORKS`) that has most tensor
+    names in common with the file.
     """
     if not Path(path).is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
