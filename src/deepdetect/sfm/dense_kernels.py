@@ -30,9 +30,9 @@ neighbour. Smaller ratios count as this one, so that the shift does not become t
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write, for each pixel of row `y`, the sum of its two least Hamming distances to neighbours.
+    """Write, for pixels of row `y`, the sum of the two least Hamming distances to neighbours.
 
-    The result `line` (D, W) has one such sum for each of D inverse depths and each column.
+    `line` (D, W) has one such sum for each of D inverse depths and each column.
     """
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
@@ -83,10 +83,7 @@ def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost)
 
 @compiled(nogil=True)
 def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
-    """Write the index of the least cost of each pixel, (H, W) float32, refined by a parabola.
-
-    `total` (H, W, D) are the costs after the aggregation.
-    """
+    """Write the index of each pixel's least cost of D, (H, W) float32, refined by a parabola."""
     count = total.shape[2]
     for y in range(first, last):
         for x in range(total.shape[1]):

@@ -159,10 +159,7 @@ def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
 
 
 def nearest_depths(view: PosedView, parts: Sequence[np.ndarray], stride_px: int) -> np.ndarray:
-    """Return the depth of the nearest point in each cell of a view, infinity in empty cells.
-
-    `parts` are arrays of points (N, 3). Cells have sides of `stride_px` pixels.
-    """
+    """Return the least depth of the points in each cell of a view, or infinity in empty cells."""
     columns, rows = (-(-side // stride_px) for side in view.camera.size)
     nearest = np.full((rows, columns), np.inf)
     for points in parts:

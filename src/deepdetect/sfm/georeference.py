@@ -80,10 +80,7 @@ class Origin:
         return np.asarray(_ellipsoid().ellipsoid_to_enu(places, *where))
 
     def to_utm(self, enu: np.ndarray) -> tuple[np.ndarray, int]:
-        """Convert (N, 3) metres east, north and up of the origin to UTM, in the origin's zone.
-
-        Also returns the EPSG number of this zone.
-        """
+        """Convert (N, 3) metres to UTM in the origin's zone; also return the zone's EPSG number."""
         where = self.latitude, self.longitude, self.height
         # pycolmap uses the UTM zone of the first point, so the origin is put first.
         all_ = np.vstack([np.zeros((1, 3)), np.asarray(enu, np.float64)])
@@ -197,10 +194,7 @@ def require_images(
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
-    """Raise an OptionError if control points or ends of a distance name images not in `names`.
-
-    At least `MIN_FIXES` control points must each be marked in two or more of these images.
-    """
+    """Raise an OptionError if images lack an end of the distance, or enough control points."""
     names = [*names]
     named = {Path(name).name: name for name in names} | {name: name for name in names}
     if control is not None:
@@ -294,11 +288,7 @@ def upright(
 
 
 class ControlRow(NamedTuple):
-    """A ground control point that is marked in an image.
-
-    `place` is its latitude and longitude in degrees and its height in metres, `xy` its pixel in the
-    image.
-    """
+    """A ground control point in an image. `place` is its latitude, longitude and height."""
 
     name: str
     place: tuple[float, float, float]
@@ -375,10 +365,7 @@ def _seen_by_several(
 
 
 def _by_file_name(names: Iterable[str]) -> dict[str, str]:
-    """Map each name by which a user may call an image to the image's full name, with its folder.
-
-    A user may give the full name, or the file name alone if only one image has it.
-    """
+    """Map names that users may give (full names, and file names if unique) to full names."""
     names = [*names]
     counts = Counter(Path(name).name for name in names)
     alone = {Path(name).name: name for name in names if counts[Path(name).name] == 1}

@@ -250,10 +250,7 @@ def _names(model: Any) -> frozenset[str]:
 
 
 def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseModel:
-    """Convert a `pycolmap.Reconstruction` to a `SparseModel`.
-
-    `sources` gives the `CameraIntrinsics.source` of each image, by name.
-    """
+    """Convert a `pycolmap.Reconstruction`; `sources` gives `CameraIntrinsics.source` by image."""
     points = np.empty((len(model.points3D), 3))
     colors = np.empty(points.shape, np.uint8)
     row_of = {}
@@ -315,10 +312,7 @@ def adjust_refined(model: Any, known_cameras: bool) -> None:
 
 
 def normalise_model(model: Any) -> None:
-    """Transform a model to the frame of the camera that sees most points, and to a common unit.
-
-    The unit is `camera_spacing`, the median distance of a camera to its nearest neighbour.
-    """
+    """Make the camera that sees most points the frame of a model, and `camera_spacing` its unit."""
     sparse = read_sparse_model(model)
     view = max(sparse.images.values(), key=lambda image: len(image.points)).view
     centres = np.array([each.centre for each in sparse.views.values()])

@@ -67,9 +67,9 @@ def reconstruct_many(
 
     Writes into the folder `output`: model.ply, model.glb, model.html (a viewer, with the cameras),
     model.json, transforms.json (for nerfstudio), sparse/0 and database.db (for COLMAP), and work/
-    with intermediate results. If at least three images have GPS, the model is in metres east, north
-    and up. The same call continues an interrupted run. The function starts processes, so a script
-    must call it under `if __name__ == "__main__":`.
+    with intermediate results. If three images have GPS, the model is in metres east, north and up.
+    The same call continues an interrupted run. The function starts processes, so a script must call
+    it under `if __name__ == "__main__":`.
 
     Args:
         images: a folder, or image files.
@@ -78,10 +78,8 @@ def reconstruct_many(
         selection: which keypoints are kept, as in `extract_features`.
         calibration: known cameras, which are kept fixed: a calibration file, a `Calibration` or a
             `Camera`. By default, focal length and distortion are estimated.
-        focal_px: rough focal length of all images in pixels. By default it comes from EXIF or,
-            without EXIF, from a guess.
-        seed: seed of all random choices. Equal seeds may still give slightly different results,
-            because of COLMAP's threads.
+        focal_px: rough focal length of all images in pixels; by default from EXIF, or a guess.
+        seed: seed of all random choices; COLMAP's threads may still cause small differences.
         options: options of all stages.
         workers: number of processes; default one per processor.
         overwrite: repeat all stages.
@@ -93,8 +91,8 @@ def reconstruct_many(
     Raises:
         ImageError: the folder is missing or holds no image.
         OptionError: an option is unknown or out of range, or differs from that of an earlier run.
-        ReconstructionError: fewer than three images can be used. Its subclass `NoDepthError` means
-            that the images do not overlap enough, or do not determine depth.
+        ReconstructionError: fewer than three images can be used.
+        NoDepthError: the images do not overlap enough, or do not determine depth.
         MissingExtraError: pycolmap or h5py is not installed.
 
     Example:
@@ -123,10 +121,7 @@ def reconstruct_many(
         unregistered[name] = f"it shows nearly the same as {other}"
         del sizes[name]
     if alike and len(sizes) < MIN_VIEWS:
-        raise NoDepthError(
-            f"only {len(sizes)} images differ, and the others show nearly the same as these: move "
-            "the camera"
-        )
+        raise NoDepthError(f"all images except {len(sizes)} show nearly the same: move the camera")
     intrinsics = initial_intrinsics(folder, sizes, known, focal_px, options.single_camera)
     with timer.stage("mapping"):
         model, verified, components = stages.map(folder, intrinsics, matches, bool(known))
@@ -316,9 +311,6 @@ def _why_unregistered(
 def _without_registered(
     components: Iterable[frozenset[str]], unregistered: Iterable[str]
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the names of the unregistered images in each component, the largest component first.
-
-    Components with fewer than two of these images are left out.
-    """
+    """Return the unregistered images in each component, if two or more, largest component first."""
     left = [tuple(sorted(names & frozenset(unregistered))) for names in components]
     return tuple(sorted((names for names in left if len(names) > 1), key=len, reverse=True))

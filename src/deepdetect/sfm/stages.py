@@ -137,10 +137,7 @@ class MultiViewOptions:
 def check_images(
     images: str | Path | Sequence[str | Path], exclude: Sequence[Path] = ()
 ) -> dict[str, Path]:
-    """Return the paths of the images that are below a folder or in a list, by image name.
-
-    If `images` is a folder, the folders in `exclude` are not searched.
-    """
+    """Return the paths of the images that are below a folder or in a list, by image name."""
     if isinstance(images, (str, Path)):
         folder = Path(images)
         return {path.relative_to(folder).as_posix(): path for path in find_images(folder, exclude)}
