@@ -76,7 +76,7 @@ def correct_places(
 def _better_places(
     pycolmap: Any, model: Any, database: Path, seed: int, quiet: bool
 ) -> dict[int, Any]:
-    """Return, by image number, new poses for images on which more points of other images agree."""
+    """Return better poses, by image number: with them, more points of other images agree."""
     how = pycolmap.AbsolutePoseEstimationOptions()
     how.ransac.max_error, how.ransac.random_seed = MAX_VERIFICATION_ERROR_PX, seed
     points, found = _Points(model), {}

@@ -55,8 +55,7 @@ MIN_DISTANCE_PX = 3
 """A new track must begin farther than this from all earlier tracks in its image. Chosen by hand."""
 
 MIN_DENSE_VIEWS = 3
-"""A dense track needs at least this number of images: with two, no third image would check the
-match."""
+"""A dense track needs at least this number of images: with two, no third one checks the match."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
 """Images are cached, because successive images share neighbours. The cached images have at most
@@ -181,8 +180,8 @@ class _Tracks:
         """Align patches of an image in other images, and turn them into points with tracks.
 
         A patch becomes a point if it is found in at least `min_views` images, including its own.
-        Only images with `MIN_COMMON_POINTS` are searched. With `tracks` (K,), indices of the
-        model's points for each patch, a patch is searched for only in images that see its point.
+        Only images that share `MIN_COMMON_POINTS` with this image are searched. If `tracks` (K,)
+        gives the model's point of each patch, only the images that see this point are searched.
         """
         own = self.numbers[name]
         pixels, points, _ = wanted
