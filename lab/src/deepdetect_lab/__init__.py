@@ -1,4 +1,5 @@
 """The laboratory of DeepDetect: data sets, labels, training, evaluation.
 
-`deepdetect` is what users run on images; this makes its weights, and measures both.
+Users run the package `deepdetect` on images. This package trains its networks, and measures how
+well they and the methods of `deepdetect` work.
 """

@@ -1,8 +1,8 @@
-"""COLMAP's camera models and its database, by pycolmap.
+"""Use COLMAP's camera models, and write its database, through pycolmap.
 
 The centre of the first pixel is (0.5, 0.5) in COLMAP and (0, 0) here, so half a pixel is added to
-positions. A scale in COLMAP is sigma, half of OpenCV's diameter; orientations are in radians,
-clockwise as in OpenCV.
+positions for COLMAP. As the scale of a keypoint, COLMAP stores sigma, half of the diameter that
+OpenCV stores. COLMAP's orientations are in radians, OpenCV's in degrees. Both are clockwise.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from ..geometry.camera import Calibration, Camera
 from ..io.exif import camera_from_exif
 
 PIXEL_CENTRE = 0.5
-"""Position of the centre of the first pixel in COLMAP; here it is 0."""
+"""COLMAP has the centre of the first pixel at (0.5, 0.5), this package at (0, 0)."""
 
 SIFT_NUMBERS = 128
 
 ROWS = 256
-"""An image is undistorted in strips of this number of rows, which bounds the memory."""
+"""An image is undistorted in strips of this number of rows, which limits the memory needed."""
 
 ESTIMATED_FOCAL_FACTOR = 1.2
-"""The estimate of an unknown focal length starts at this times the longer side, as in COLMAP."""
+"""An unknown focal length is first guessed as this factor times the longer side of the image, as in
+COLMAP. The mapping then refines the guess."""
 
 
 @contextmanager
@@ -56,9 +57,10 @@ class CameraIntrinsics:
     Attributes:
         model: name, such as "PINHOLE" or "SIMPLE_RADIAL".
         size: (width, height) in pixels.
-        params: COLMAP's parameters: focal lengths, principal point, then distortion. The centre of
-            the first pixel is (0.5, 0.5).
-        source: where the parameters come from: "given", "focal_px", "EXIF", or "estimated".
+        params: parameters in COLMAP's order: focal lengths, principal point, then distortion. The
+            principal point is in pixels with the centre of the first pixel at (0.5, 0.5).
+        source: where the focal length comes from: "given" (by a calibration), "focal_px" (by the
+            option of that name), "EXIF", or "estimated" (from a guess).
     """
 
     model: str
@@ -76,9 +78,10 @@ class CameraIntrinsics:
     def initial(
         cls, size: tuple[int, int], focal_px: float | None = None, source: str = "EXIF"
     ) -> CameraIntrinsics:
-        """Return initial intrinsics with one parameter of radial distortion, to be estimated.
+        """Return initial intrinsics with one radial distortion parameter. The mapping refines them.
 
-        The focal length is `focal_px`, or a guess; `source` says where it comes from.
+        `source` says where `focal_px` comes from. Without `focal_px`, the focal length is guessed,
+        and the source is "estimated".
         """
         if focal_px is None:
             focal_px, source = ESTIMATED_FOCAL_FACTOR * max(size), "estimated"
@@ -101,19 +104,19 @@ class CameraIntrinsics:
 
     @property
     def distorts(self) -> bool:
-        """Whether the camera model has distortion, that is, is not a pinhole camera."""
+        """Whether the camera model has distortion parameters, unlike a pinhole model."""
         return self.model not in ("PINHOLE", "SIMPLE_PINHOLE")
 
     @property
     def pinhole(self) -> Camera:
-        """The pinhole camera of the same focal length and principal point."""
+        """The pinhole camera with the same focal lengths and principal point."""
         camera = self.colmap_camera()
         focal = (float(camera.focal_length_x), float(camera.focal_length_y))
         centre = (float(camera.principal_point_x), float(camera.principal_point_y))
         return Camera(self.size, focal, (centre[0] - PIXEL_CENTRE, centre[1] - PIXEL_CENTRE))
 
     def to_pinhole(self, xy: np.ndarray) -> np.ndarray:
-        """Map (N, 2) pixels of the image to pixels of the pinhole camera, without distortion."""
+        """Map (N, 2) pixels of the distorted image to undistorted pixels of `pinhole`."""
         if not self.distorts or not len(xy):
             return xy
         pinhole = self.pinhole
@@ -121,7 +124,7 @@ class CameraIntrinsics:
         return np.asarray(rays * pinhole.focal_px + np.array(pinhole.centre))
 
     def from_pinhole(self, xy: np.ndarray) -> np.ndarray:
-        """Map (N, 2) pixels of the pinhole camera to pixels of the image, with distortion."""
+        """Map (N, 2) undistorted pixels of `pinhole` to pixels of the distorted image."""
         if not self.distorts or not len(xy):
             return xy
         found = self.colmap_camera().img_from_cam(self.pinhole.rays(xy))
@@ -129,13 +132,17 @@ class CameraIntrinsics:
 
     @property
     def without_border(self) -> CameraIntrinsics:
-        """The pinhole camera, cropped by COLMAP so that undistorted images have no border."""
+        """Pinhole intrinsics that COLMAP crops so that undistorted images have no empty border."""
         pycolmap = import_pycolmap()
         cropped = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self.colmap_camera())
         return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
 
     def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
-        """Undistort an image (H, W) or (H, W, 3) of this camera, which may be scaled."""
+        """Undistort an image, (H, W) or (H, W, 3), taken by this camera.
+
+        The result is the image of the camera `pinhole` (default: `self.pinhole`). The given image
+        may be a scaled copy of the photograph.
+        """
         if not self.distorts:
             return image
         pinhole, camera = pinhole or self.pinhole, self.colmap_camera()
@@ -155,9 +162,9 @@ class CameraIntrinsics:
 def known_cameras(
     calibration: Camera | Calibration | str | Path, sizes: Mapping[str, tuple[int, int]]
 ) -> dict[str, Camera]:
-    """Return the cameras, by name, of the images that have the size of a calibration.
+    """Return, by image name, the calibrated camera of each image whose size the calibration fits.
 
-    Raises a ReconstructionError if the calibration is wrong, or fits none of the images.
+    Raises a ReconstructionError if the calibration is invalid, or fits no image.
     """
     known: dict[str, Camera] = {}
     problem: ReconstructionError | None = None
@@ -183,10 +190,11 @@ def initial_intrinsics(
     focal_px: float | None = None,
     single_camera: bool | None = None,
 ) -> dict[str, CameraIntrinsics]:
-    """Return the known intrinsics of each image, or initial ones to be estimated.
+    """Return the intrinsics of each image: those in `known`, or initial values to be refined.
 
-    `focal_px` is for images whose camera is not known. If it is None, EXIF or a guess gives it.
-    Images that share a camera (`MultiViewOptions.single_camera`) get the same object.
+    `focal_px` is the initial focal length of images that are not in `known`. If it is None, the
+    focal length comes from EXIF or, without EXIF, from a guess. Images that share a camera
+    (`MultiViewOptions.single_camera`) get the same object.
     """
     begins = {}
     for name, size in sizes.items():
@@ -206,7 +214,8 @@ def initial_intrinsics(
         name: {None: begin, True: begin.size, False: name}[single_camera]
         for name, begin in begins.items()
     }
-    # Images without EXIF come last: a shared camera takes the focal length of its first image.
+    # A shared camera takes the intrinsics of its first image in this order. Images with a guessed
+    # focal length come last, so that a focal length from EXIF is preferred.
     for name in sorted(begins, key=lambda name: begins[name].source == "estimated"):
         shared.setdefault(keys[name], begins[name])
     return {name: shared[keys[name]] for name in sizes}
@@ -219,12 +228,12 @@ def write_database(
 ) -> None:
     """Write a new COLMAP database to a file that does not exist or is empty.
 
-    Images with the same intrinsics object share a camera. Keypoints with sizes get four columns
-    (x, y, scale, orientation), others two. Descriptors are converted by `sift_bytes`. Matches are
-    (K, 2) indices of keypoints.
+    Images with the same intrinsics object share a camera. Keypoints are written as (x, y, scale,
+    orientation) if they have sizes, otherwise as (x, y). `sift_bytes` converts their descriptors.
+    The matches of a pair of images are (K, 2) indices of keypoints.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
-        cameras: dict[int, tuple[int, int]] = {}  # numbers of camera and rig, by object
+        cameras: dict[int, tuple[int, int]] = {}  # camera ID and rig ID, by `id` of the intrinsics
         numbers: dict[str, int] = {}
         for name, (points, intrinsics) in images.items():
             if id(intrinsics) not in cameras:
@@ -257,18 +266,19 @@ def write_database(
 
 
 def orientations_of(points: Keypoints) -> np.ndarray:
-    """Return (N,) orientations in radians, clockwise, or 0 for keypoints without one."""
+    """Return (N,) orientations in radians, clockwise. Keypoints without an orientation get 0."""
     if points.angles is None:
         return np.zeros(len(points), np.float32)
     return np.deg2rad(np.where(points.angles == UNSET_ANGLE, 0, points.angles))
 
 
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
-    """Return descriptors in the format of SIFT, (N, 128) uint8, or None if they do not fit it.
+    """Convert descriptors to SIFT's format, (N, 128) uint8. Return None if this is impossible.
 
-    Descriptors of length 1 are multiplied by 512, as in SIFT. The 64 numbers of learned descriptors
-    become 128: their positive and their negative parts. COLMAP can then compare them. The rounding
-    loses one or two of 100 correct matches. COLMAP's vocabulary trees suit only SIFT.
+    Descriptors of length 1 are multiplied by 512, as is usual for SIFT. A learned descriptor has 64
+    numbers of either sign. They become 128 numbers from 0 up, which COLMAP can compare: first the
+    positive parts, then the absolute values of the negative parts. The rounding to bytes loses one
+    or two of 100 correct matches. COLMAP's vocabulary trees suit only SIFT descriptors.
     """
     found = keypoints.descriptors
     if found is not None and is_learned(keypoints.descriptor_type):

@@ -1,8 +1,9 @@
-"""Compiled kernels of dense points. Importing them loads numba; the first call compiles.
+"""Compiled kernels for dense points. Importing this module loads numba; first calls compile.
 
-Kernels work on the rows `first` to `last - 1`. The surface around a pixel is a plane, so its
-inverse depth is linear in the position of the pixel. A pixel (x, y) of inverse depth w projects to
-a neighbour at A (x, y, 1) + w b, in homogeneous coordinates, with A (3, 3) and b (3,).
+Each kernel processes the rows `first` to `last - 1` of an image. The surface around a pixel is
+modelled as a plane, so its inverse depth is a linear function of the pixel position. The pixel
+(x, y) with inverse depth w projects to the neighbouring image at A (x, y, 1) + w b in homogeneous
+coordinates. A (3, 3) and b (3,) follow from the two cameras.
 """
 
 from __future__ import annotations
@@ -15,20 +16,24 @@ from .._shared.kernels import compiled
 from ..matching.stereo.kernels import count_bits
 
 HIDDEN = np.uint64(1) << np.uint64(63)
-"""This bit, above the 62 bits of a census, marks pixels outside the neighbouring image."""
+"""A census has 62 bits. This higher bit marks pixels that the neighbouring image does not show."""
 
 MIN_TEXTURE = np.float32(0.18)
-"""A window has texture if the variance of its gradients along the epipolar line exceeds that of the
-noise by this share. Plain skies with JPEG artefacts stay below it, weathered stone is above.
-"""
+"""A window has texture if the variance of its gradients along the epipolar line exceeds this
+multiple of the variance of the noise. Plain skies with JPEG artefacts lie below this threshold,
+weathered stone lies above it."""
 
 MIN_GAIN = np.float32(0.2)
-"""A shift is divided by the neighbour's contrast relative to the reference, at least by this."""
+"""The computed shift of a window is divided by the reference's contrast relative to that of the
+neighbour. Smaller ratios count as this one, so that the shift does not become too large."""
 
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write the sum of the two smallest Hamming distances to the neighbours, for one row (D, W)."""
+    """Write, for pixels of row `y`, the sum of the two least Hamming distances to neighbours.
+
+    `line` (D, W) has one such sum for each of D inverse depths and each column.
+    """
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
     for d in range(count):
@@ -48,11 +53,12 @@ def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type:
 
 @compiled(nogil=True)
 def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost):  # type: ignore[no-untyped-def]
-    """Write the matching costs of inverse depths, (H, W, D) uint8.
+    """Write the matching cost of each pixel at each of D inverse depths, (H, W, D) uint8.
 
-    A cost is an eighth of the sum, over 3 x 3 pixels, of the Hamming distances to the two
-    neighbours that agree best. `neighbours` (K, H', W') are censuses in the frame of the reference.
-    The pixel (x, y) at the inverse depth number d is at `columns` (K, D, W) and `rows` (K, D, H).
+    At each pixel, the Hamming distances to the two neighbours that agree best are added. A cost is
+    the sum of these numbers over 3 x 3 pixels, divided by 8. `neighbours` (K, H', W') are the
+    censuses of neighbours, warped to the reference. In neighbour k, the pixel (x, y) at inverse
+    depth number d is at column `columns[k, d, x]` and row `rows[k, d, y]`.
     """
     height, width, count = cost.shape
     line = np.empty((count, width), np.uint8)
@@ -77,7 +83,7 @@ def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost)
 
 @compiled(nogil=True)
 def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
-    """Write the index of the least of D summed costs, (H, W) float32, refined by a parabola."""
+    """Write the index of each pixel's least cost of D, (H, W) float32, refined by a parabola."""
     count = total.shape[2]
     for y in range(first, last):
         for x in range(total.shape[1]):
@@ -96,10 +102,11 @@ def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out):  # type: ignore[no-untyped-def]
-    """Fit a plane around each pixel, to the inverse depths that lie near its present plane.
+    """Fit a plane around each pixel to the inverse depths within `tolerance` of its current plane.
 
-    `planes` (H, W, 3) float32 are inverse depths, NaN where unknown, and their changes per pixel
-    to the right and down. A plane that would fit fewer than `min_pixels` becomes NaN.
+    `planes` (H, W, 3) float32 hold the inverse depth of a pixel, NaN if unknown, then its change
+    per pixel to the right, then per pixel down. If fewer than `min_pixels` inverse depths lie near
+    the current plane, the new inverse depth is NaN. `weights` (H, W) are those of the fit.
     """
     height, width = planes.shape[:2]
     for y in range(first, last):
@@ -130,7 +137,7 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
             e, f = siv - si * sv / n, sjv - sj * sv / n
             area = a * c - b * b
             more_right = more_down = 0.0
-            if area > n:  # the pixels are not on a line
+            if area > n:  # else they lie on a line, and the slopes stay
                 more_right, more_down = (e * c - f * b) / area, (f * a - e * b) / area
             out[y, x, 0] = w + (sv - more_right * si - more_down * sj) / n
             out[y, x, 1] = right + more_right
@@ -139,7 +146,10 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
 
 @compiled(nogil=True, inline="always")
 def _project(m, x, y, w):  # type: ignore[no-untyped-def]
-    """Project pixel (x, y) with inverse depth w to a neighbour: position and relative depth."""
+    """Project pixel (x, y) with inverse depth w to a neighbour.
+
+    Returns x and y there, and the depth there divided by the depth here.
+    """
     z = m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3]
     across = m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]
     down = m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]
@@ -148,12 +158,12 @@ def _project(m, x, y, w):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  # type: ignore[no-untyped-def]
-    """Compare the window around a pixel with that of a neighbour, warped by the plane.
+    """Compare the window around a pixel with the window that its plane maps it to in a neighbour.
 
     Returns correlation, shift, parallax and weight. The correlation is -1 if the neighbour does not
-    show the whole window. The shift, in pixels along the epipolar line, is one step of Lucas-Kanade
-    that allows for other contrast and brightness. Its weight is 0 without texture. The parallax is
-    in pixels per unit of inverse depth.
+    show the whole window. The shift, in pixels along the epipolar line, is one Lucas-Kanade step
+    that compensates differences of contrast and brightness. The parallax is the motion of the match
+    in pixels per unit of inverse depth. The weight of the shift is 0 if the window has no texture.
     """
     nothing = np.float32(-1), np.float32(0), 0.0, np.float32(0)
     w, right, down = plane
@@ -218,7 +228,7 @@ def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  
 
 @compiled(nogil=True)
 def _score(gray, y, x, plane, same, neighbours, sizes, maps, radius, spacing, noise, sure):  # type: ignore[no-untyped-def]
-    """Return the mean correlation with the two neighbours that correlate best."""
+    """Return the mean of the two best correlations of a window with the neighbours."""
     best = second = np.float32(-1)
     for k in range(len(neighbours)):
         found = _compare(
@@ -236,11 +246,12 @@ def propagate_rows(  # type: ignore[no-untyped-def]
     first, last, planes, scores, jump, sure, stride, gray, neighbours, sizes, maps, radius, spacing,
     noise, out, found,
 ):  # fmt: skip
-    """Give pixels below the correlation `sure` the best plane of four pixels `jump` away.
+    """Let each pixel that correlates worse than `sure` try the planes of four other pixels.
 
-    A pixel keeps its plane if none of the four correlates better. `scores` (H, W) are the
-    correlations of the given planes, `found` the correlations of the new planes. `refine_rows`
-    describes the other arguments.
+    The others are `jump` pixels to the right, to the left, below and above. The pixel takes the
+    plane with which its window correlates best, or keeps its own. With a `jump` of 0, only the
+    correlation of its own plane is computed. `scores` (H, W) are the correlations of the given
+    planes, `found` those of the new planes. `refine_rows` describes the other arguments.
     """
     height, width = gray.shape
     rows, columns = planes.shape[:2]
@@ -278,14 +289,17 @@ def refine_rows(  # type: ignore[no-untyped-def]
     first, last, planes, stride, gray, neighbours, sizes, maps, radius, spacing, noise, tolerance,
     min_correlation, min_number, out, errors, certainty,
 ):  # fmt: skip
-    """Write the inverse depths after one step of Lucas-Kanade over all neighbours together.
+    """Refine each inverse depth by one Lucas-Kanade step that all neighbours share.
 
-    `planes` (H, W, 3), as in `fit_rows`, are at every `stride`-th pixel of `gray`, with slopes per
-    pixel of `gray`. `neighbours` (K, H', W') float32 have (width, height) `sizes`, and `maps`
-    (K, 3, 4) are A and b. Every `spacing`-th pixel of the window is used if it is on the same
-    surface. `errors` are root mean square distances in pixels to the matches of each neighbour
-    alone. If fewer than `min_number` neighbours correlate, the depth becomes NaN. If none has
-    texture along its epipolar line, the depth stays. `certainty` is 0 in both cases.
+    `planes` (H, W, 3) are as in `fit_rows`, one for every `stride`-th pixel of `gray` in both
+    directions, with slopes per pixel of `gray`. `neighbours` (K, H', W') float32 are padded images
+    whose true (width, height) are `sizes` (K, 2). `maps` (K, 3, 4) are A and b side by side. Every
+    `spacing`-th pixel of the window is compared if it lies on the surface of the middle pixel.
+
+    `out` are the new inverse depths. `errors` are root mean square distances, in pixels, to the
+    matches that each neighbour alone would give. An inverse depth becomes NaN if fewer than
+    `min_number` neighbours correlate by `min_correlation`. It stays if none of them has texture
+    along the epipolar line. `certainty` is 0 in both cases.
     """
     height, width = gray.shape
     side = 2 * radius + 1
@@ -335,15 +349,20 @@ def fuse_rows(  # type: ignore[no-untyped-def]
     first, last, planes, neighbours, sizes, stride, there, back, rays, centres, max_error,
     max_difference, min_angle, fused, views, shown,
 ):  # fmt: skip
-    """Write the mean inverse depth of the depth maps that agree on each pixel of the first map.
+    """Write, for each pixel of the first map, the mean inverse depth of the maps that agree on it.
 
-    `planes` (H, W, 3) and `neighbours` (K, H', W', 3), NaN where unknown, are at every `stride`-th
-    pixel. `sizes` (K, 2) are the rows and columns of the neighbours. `there` and `back` (K, 3, 4)
-    are A and b from the first image to the neighbours, and back. `rays` (3, 3) maps pixels to lines
-    of sight. `centres` (K, 3) are camera centres of the neighbours in the same frame. A neighbour
-    agrees if its own surface reprojects to within `max_error` pixels. `views` (H, W) is the number
-    of images that agree, including the first, or 0. `shown` (H, W) is the number whose frame
-    contains the point.
+    The first map `planes` (H, W, 3) and the `neighbours` (K, H', W', 3) hold every `stride`-th
+    pixel in both directions, with NaN where the depth is unknown. `sizes` (K, 2) are the numbers of
+    rows and columns of the neighbours. `there` (K, 3, 4) are A and b from the first image to each
+    neighbour, `back` (K, 3, 4) those from each neighbour to the first. `rays` (3, 3) maps pixels
+    (x, y, 1) to lines of sight. `centres` (K, 3) are the neighbours' camera centres in the frame of
+    the first camera.
+
+    A neighbour agrees if the point of its own surface reprojects to within `max_error` pixels, and
+    its inverse depth differs by at most the fraction `max_difference`. `views` (H, W) is the number
+    of images that agree, including the first. It is 0 if no line of sight of a neighbour differs
+    from that of the first image by `min_angle` radians. `shown` (H, W) is the number of images
+    whose frame contains the point, including the first.
     """
     for row in range(first, last):
         for column in range(planes.shape[1]):
@@ -388,11 +407,13 @@ def fuse_rows(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def support_rows(first, last, planes, stride, chosen, reach, spacing, tolerance, support):  # type: ignore[no-untyped-def]
-    """Write, per pixel, the share of the pixels around it that are `chosen` and on its surface.
+    """Write, per pixel, the fraction of the pixels around it that are `chosen` and on its surface.
 
-    The pixels around it are every `spacing`-th pixel of a square, up to `reach` pixels away, inside
-    the image. `chosen` is (H, W), and `planes` are as in `fuse_rows`. A pixel is on the surface if
-    its inverse depth differs from the plane by at most `tolerance`, relative to the inverse depth.
+    The pixels around it are every `spacing`-th one, in both directions, of a square that reaches
+    `reach` pixels to each side. They include the pixel itself, but none outside the map. `chosen`
+    (H, W) is a mask, and `planes` are as in `fuse_rows`. A pixel is on the surface if its inverse
+    depth differs from the middle pixel's plane by at most `tolerance` times the inverse depth of
+    the middle pixel.
     """
     height, width = chosen.shape
     for row in range(first, last):

@@ -1,9 +1,9 @@
-"""Depth maps of images with known cameras.
+"""Compute depth maps of images whose cameras are known.
 
-Semi-global matching of small copies gives the first inverse depths. Pixels that correlate badly
-then take over planes of other pixels, and matching of the full-size grey images refines all planes.
-Each pixel has a plane, so slanted surfaces are matched as well as frontal ones. A pixel without
-texture gets a depth only between textured pixels of the same surface.
+Semi-global matching of downscaled copies gives the first inverse depths. Each pixel then gets a
+plane, so that slanted surfaces are matched as well as frontal ones. Pixels that correlate badly may
+take over the plane of another pixel, and matching of the full-size grey images refines all planes.
+A pixel without texture gets a depth only if it lies between textured pixels of the same surface.
 """
 
 from __future__ import annotations
@@ -26,100 +26,119 @@ from .colmap import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel
 
 MATCHED_NEIGHBOURS = 4
-"""Number of neighbours that an image is matched with; time grows with it. Chosen by hand."""
+"""An image is matched with up to this number of neighbours; each takes time. Chosen by hand."""
 
 NEIGHBOURS = 8
-"""Number of neighbours whose depth maps are compared with that of an image. Chosen by hand."""
+"""A depth map is compared with those of at most this number of neighbours. Chosen by hand."""
 
 MIN_COMMON_POINTS = 30
-"""Number of sparse points that a neighbour must share with the image. Chosen by hand."""
+"""A neighbour must share at least this number of sparse points with the image. Chosen by hand."""
 
 IDEAL_ANGLE_DEG = 5.0
-"""A shared point seen at a smaller angle counts less: its depth is uncertain. Chosen by hand."""
+"""Neighbours are ranked by the sparse points that they share with the image. A point whose two
+lines of sight form a smaller angle counts less, because its depth is uncertain. Chosen by hand."""
 
 MAX_ANGLE_DEG = 30.0
-"""A shared point seen at a larger angle counts less: surfaces look different. Chosen by hand."""
+"""Neighbours are ranked by the sparse points that they share with the image. A point whose two
+lines of sight form a larger angle counts less, because surfaces look different. Chosen by hand."""
 
 MAX_SIDE_PX = 2000
-"""Images with a longer side are scaled down to this, which bounds time and memory."""
+"""Images whose longer side exceeds this are scaled down to it, which limits time and memory."""
 
 CACHED_IMAGES = 16
-"""Number of undistorted images that a process caches: successive images share neighbours."""
+"""A process caches this number of undistorted images: successive images share neighbours."""
 
 SMALL_SCALE = 0.5
-"""Copies for semi-global matching have at most this scale. Half of it takes an eighth of the
-time."""
+"""Images are scaled by at most this factor for semi-global matching. Halving the factor divides the
+time by eight."""
 
 MAX_VOLUME = 3e7
-"""A copy with more pixels times inverse depths is scaled down further, which bounds the memory."""
+"""Images are scaled down further for semi-global matching if their number of pixels, times the
+number of inverse depths, would exceed this. This limits the memory."""
 
 TAIL_FRACTION, DEPTH_MARGIN = 0.002, 0.2
-"""The search range leaves out the first fraction of the sparse points at each end of their inverse
-depths, because such points may be wrong. It is then extended at each end by the second fraction of
-its length. Chosen by hand."""
+"""The search range spans the inverse depths of the sparse points. `TAIL_FRACTION` of the points is
+ignored at each end, because these may be wrong. The range is then extended at each end by
+`DEPTH_MARGIN` times its length. Chosen by hand."""
 
 MIN_FAR = 0.1
-"""The search ends at this share of the smallest inverse depth of a sparse point. Chosen by hand."""
+"""The smallest inverse depth that is searched is at least this fraction of the smallest one of the
+sparse points, so that it stays above 0. Chosen by hand."""
 
 MAX_APPROACH = 0.5
-"""Images are first aligned at one depth, which must lie ahead of all cameras. The foremost camera
-has covered at most this share of the distance to that depth. Chosen by hand."""
+"""The search first aligns all images at one depth of the first image, which must lie ahead of all
+cameras. A camera ahead of the first one has covered at most this fraction of the way to that depth.
+Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
-"""A step of the search moves a pixel at this quantile of all motions by one pixel. It is the
-median, because pixels near the epipole hardly move."""
+"""One step of inverse depth in the search should move a match by one pixel. Some matches move more
+than others, so this quantile of the motions over the image is used. It is the median, because
+matches near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
-"""Inverse depths are on different surfaces if they move a match in a small copy this far apart."""
+"""Two inverse depths belong to different surfaces if their matches are farther apart than this in
+the downscaled images of the search."""
 
 FIT_RADIUS_PX = 3
-"""Radius of the windows in which planes are fitted to a small depth map. Chosen by hand."""
+"""Planes are fitted to the downscaled depth map in windows of this radius. Chosen by hand."""
 
 FIT_TOLERANCES_PX = (4, 2, 1)
-"""Tolerances of successive fits, in steps of the search. The first is wide, so that fits that begin
-with frontal planes can follow steep surfaces such as the ground. Chosen by hand."""
+"""Planes are fitted three times, each time to the inverse depths within this tolerance of the
+current plane, in steps of the search. The first planes are frontal. The first tolerance is wide, so
+that the fit can turn them into steep surfaces such as the ground. Chosen by hand."""
 
 MIN_FITTED = 12
-"""Number of pixels that a plane must fit: smaller isolated patches are wrong. Chosen by hand."""
+"""A plane must fit at least this number of pixels: smaller patches are wrong. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
-"""Windows of the first radius are compared, by pixels at the second spacing. Chosen by hand."""
+"""Windows that reach `WINDOW_RADIUS_PX` to each side of a pixel are compared. Only pixels
+`WINDOW_SPACING_PX` apart in them are read. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
-"""Sigma of the blur before windows are compared, so that the pixels read represent the rest."""
+"""Images are blurred with this sigma before windows are compared. Only some of the pixels of a
+window are read, and after the blur they represent the others."""
 
 NOISE_LEVELS = 1.0
-"""Noise of a pixel in grey levels; weaker gradients do not move a depth. Chosen by hand."""
+"""Assumed noise of a pixel in grey levels: weaker gradients move no depth. Chosen by hand."""
 
 JUMPS = (16, 8, 4, 2, 1)
-"""Distances over which planes spread, in pixels of the depth map: five passes cover 31 pixels."""
+"""Pixels try the planes of pixels at this distance in the depth map, one distance in each of five
+passes. A plane can thus spread over 31 pixels."""
 
 SURE_CORRELATION = 0.9
-"""A pixel that correlates better than this keeps its plane, which saves time. Chosen by hand."""
+"""A pixel whose window correlates at least this well with other images keeps its plane, and does
+not try those of other pixels, which saves time. Chosen by hand."""
 
 MIN_CORRELATION = 0.5
-"""A neighbour refines a pixel only if its window correlates at least this well. Chosen by hand."""
+"""A neighbour refines a depth only if the windows correlate at least this well. Chosen by hand."""
 
 SMOOTHING_RADII = (4, 3)
-"""Radii of the fits after the two refinements, in pixels of the depth map. Chosen by hand."""
+"""Planes are refined twice. After each refinement they are smoothed by a fit in windows of this
+radius, in pixels of the depth map. Chosen by hand."""
 
 MIN_WEIGHT = 0.02
-"""Weight of a pixel without texture in smoothing; half of the textured ones exceed 0.5."""
+"""Weight of a pixel without texture when planes are smoothed. Half of the textured pixels have
+weights above 0.5."""
 
 MIN_VIEWS = 3
-"""Number of images that must agree on a pixel, including its own: a third image confirms the match
-of two. `fusion` asks for other numbers in some places."""
+"""The depth of a pixel is kept only if at least this number of images agree on it, including the
+pixel's own: a third image confirms the match of two. `fusion` asks for other numbers in some
+places, such as depth edges."""
 
 DEPTH_PIXEL = np.dtype(
     [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True
 )
-"""Pixel of a depth map. `plane` is the inverse depth (NaN if unknown) and its change per pixel of
-the image to the right and down. `error` is the root mean square distance in pixels to the matches
-that each neighbour alone would give. `color` is sRGB."""
+"""A pixel of a depth map. `plane` is its inverse depth (NaN if unknown), then the change of inverse
+depth per image pixel to the right, then down. `error` is the root mean square distance, in pixels,
+from the matches at this depth to those that each neighbour alone would give. `color` is sRGB."""
 
 
 def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
-    """Return each image with its best neighbours, which share many points at a good angle."""
+    """Return, for each image, a list of the image itself and then its best neighbours.
+
+    The best neighbours share many sparse points with the image, seen at a good angle. An image with
+    fewer than `MIN_VIEWS - 1` neighbours is left out.
+    """
     found = []
     for image in sorted(sparse.images.values(), key=lambda image: -len(image.points)):
         scored: list[tuple[float, RegisteredImage]] = []
@@ -145,8 +164,8 @@ def depth_map(
 ) -> np.ndarray:
     """Match the first image with the others; return its depth map, (H, W) `DEPTH_PIXEL`.
 
-    The map has every `stride_px`-th pixel of a row and of a column. The search covers the depths of
-    the `points` (N, 3) of the sparse model.
+    The map has a pixel for every `stride_px`-th pixel of the image in each direction. The search
+    covers the depths of those of the sparse model's `points` (N, 3) that the first image shows.
     """
     rgbs, views = zip(*(prepared_image(folder, image) for image in images), strict=True)
     grays = [luma(rgb) for rgb in rgbs]
@@ -156,7 +175,7 @@ def depth_map(
     low, high = np.quantile(1 / depth[seen], [TAIL_FRACTION, 1 - TAIL_FRACTION])
     margin = DEPTH_MARGIN * (high - low)
     small, step = _search(grays, views, (max(low - margin, MIN_FAR * low), high + margin))
-    # Resample from the pixels of the small copy to those of the depth map.
+    # Resample from the pixels of the downscaled image to those of the depth map.
     ratio = np.divide(small.shape[1::-1], size)
     whole = [np.arange(0, side, stride_px) for side in size]
     places = [(at + 0.5) * each - 0.5 for at, each in zip(whole, ratio, strict=True)]
@@ -177,14 +196,14 @@ def depth_map(
 def _search(
     grays: Sequence[np.ndarray], views: Sequence[PosedView], searched: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """Search the range `searched` of inverse depths by semi-global matching of small copies.
+    """Search the range `searched` of inverse depths by semi-global matching of downscaled images.
 
-    Returns (h, w, 3) planes in pixels of the small copy of the first image, and the step of the
-    inverse depth, which moves a match in the small copy by one pixel.
+    Returns the planes (h, w, 3), in pixels of the downscaled first image, and the step between two
+    inverse depths, which moves a match in the downscaled images by about one pixel.
     """
     from .dense_kernels import choose_rows, cost_rows
 
-    # The depth at which neighbours are aligned must lie ahead of a camera that moves forward.
+    # Neighbours are aligned at one depth, which must lie ahead of them even if they moved forward.
     passed = max(-relative_projection(views[0], view)[1][2] for view in views[1:])
     middle = min(float(np.mean(searched)), MAX_APPROACH / max(passed, 1e-9))
     parallax = max(_parallax(views[0], view, middle) for view in views[1:])
@@ -200,9 +219,9 @@ def _search(
     inverse = np.linspace(*searched, count)
     own = copies[0]
     size = np.array(own.shape[::-1])
-    # Neighbours are warped by the homography of the middle depth. Any other depth then differs only
-    # by a shift and a scale of the whole image.
-    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # first and last pixel, x and y
+    # Neighbours are warped by the homography of the middle depth. For any other depth, the warped
+    # image then only has to be shifted and scaled as a whole.
+    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # [k, first or last, x or y]
     for view, places in zip(small[1:], corners, strict=True):
         matrix, vector = relative_projection(small[0], view)
         warp = matrix + middle * np.outer(vector, [0, 0, 1])
@@ -240,7 +259,11 @@ def _search(
 def _warped_census(
     gray: np.ndarray, warp: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
-    """Return the census of an image that a homography warps to the pixels `first` to `last`."""
+    """Return the census of an image after a homography has warped it.
+
+    `first` and `last` are the upper left and the lower right pixel (x, y) of the warped image.
+    Pixels that the image does not show become `HIDDEN`.
+    """
     from .dense_kernels import HIDDEN
 
     across, down = last - first + 1
@@ -255,7 +278,7 @@ def _warped_census(
 
 
 def _fit(planes: np.ndarray, weights: np.ndarray, radius: int, tolerance: float) -> np.ndarray:
-    """Fit a plane around each pixel, to the inverse depths that lie near its present plane."""
+    """Fit a plane around each pixel to the inverse depths near its current plane."""
     from .dense_kernels import fit_rows
 
     fitted = np.empty_like(planes)
@@ -270,7 +293,7 @@ def _refine(
     stride_px: int,
     step: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine (H, W, 3) planes by matching full-size images; also return the errors in pixels."""
+    """Refine planes (H, W, 3) by matching full-size images; also return their errors in pixels."""
     from .dense_kernels import propagate_rows, refine_rows
 
     blurred = [cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_SIGMA_PX) for gray in grays]
@@ -297,10 +320,10 @@ def _refine(
         sure = certainty > 0
         usual = np.median(certainty[sure]) if sure.any() else 1
         weights = certainty / (certainty + usual) + np.float32(MIN_WEIGHT)
-        # The fit needs slopes per pixel of the depth map; elsewhere they are per pixel of an image.
+        # The fit needs slopes per pixel of the depth map. All other code has them per image pixel.
         planes = _fit(np.dstack([refined, planes[..., 1:] * stride_px]), weights, radius, tolerance)
         planes[..., 1:] /= stride_px
-    # A window can reach texture that its own pixel does not have, so the textured area is eroded.
+    # A window can have texture although its middle pixel does not, so the textured area is eroded.
     reach = np.ones((2 * -(-WINDOW_RADIUS_PX // stride_px) + 1,) * 2, np.uint8)
     textured = cv2.erode((sure | np.isnan(planes[..., 0])).astype(np.uint8), reach) > 0
     planes[~_enclosed(planes, textured, stride_px, tolerance)] = np.nan
@@ -308,10 +331,10 @@ def _refine(
 
 
 def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: float) -> np.ndarray:
-    """Return a mask of pixels that are `sure`, or lie on one surface between two that are.
+    """Return a mask of the pixels that are `sure`, or lie between two sure pixels of one surface.
 
-    The two are to the left and right, or above and below. All other depths are extrapolated from
-    one side, such as that of a roof into the sky.
+    The two sure pixels are to the left and right of the pixel, or above and below it. All other
+    depths are extrapolated from one side only, for example from a roof into the sky.
     """
     found = sure.copy()
     for axis in (0, 1):
@@ -326,14 +349,17 @@ def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: f
 
 
 def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return a mask of `known` pixels and the pixels below them, up to the next surface."""
+    """Return a mask of `known` pixels and of those below them, until a new surface `begins`."""
     rows = np.arange(len(known))[:, None]
     last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
     return last >= first
 
 
 def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray, np.ndarray]:
-    """Return A (3, 3) and b (3,): (x, y) with inverse depth w projects to A (x, y, 1) + w b."""
+    """Return A (3, 3) and b (3,), which project pixels of the first view to the second.
+
+    Pixel (x, y) with inverse depth w projects to A (x, y, 1) + w b, in homogeneous coordinates.
+    """
     moved, matrix = second.relative_to(first), second.camera.matrix
     return matrix @ moved.rotation @ np.linalg.inv(first.camera.matrix), matrix @ moved.translation
 
@@ -341,15 +367,16 @@ def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray
 def relative_projections(
     first: PosedView, others: Sequence[PosedView], back: bool = False
 ) -> np.ndarray:
-    """Return A and b, (K, 3, 4), from the first view to the others, or `back` from them."""
+    """Return A and b side by side, (K, 3, 4), from the first view to K others (`back`: to it)."""
     pairs = [(other, first) if back else (first, other) for other in others]
     return np.array([np.column_stack(relative_projection(*pair)) for pair in pairs])
 
 
 def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> float:
-    """Return the motion of matches in pixels per unit of inverse depth, as a quantile of the image.
+    """Return the motion of matches in pixels per unit of inverse depth, at a given inverse depth.
 
-    Near the epipole, which lies ahead of a camera that moves forward, they do not move.
+    It is the `PARALLAX_QUANTILE` of the motions all over the image, because matches near the
+    epipole do not move. The epipole lies ahead of a camera that moves forward.
     """
     matrix, vector = relative_projection(first, second)
     x, y = (np.linspace(0, side - 1, 7)[1:-1] for side in first.camera.size)
@@ -361,7 +388,7 @@ def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> floa
 
 
 def prepared_image(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView]:
-    """Return an undistorted image, at most `MAX_SIDE_PX` on its longer side, and its view."""
+    """Return an undistorted image, whose longer side is at most `MAX_SIDE_PX`, and its view."""
     path, view = folder / image.view.name, limited_view(image.view)
     return _undistorted(path, file_state(path), image.intrinsics, view.camera), view
 
@@ -370,7 +397,7 @@ def prepared_image(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, Po
 def _undistorted(
     path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, camera: Camera
 ) -> np.ndarray:
-    """Read and undistort an image; a changed file has another `state` and is read again."""
+    """Read and undistort an image. A changed file has another `state`, so the cache misses it."""
     rgb = load_image(path, max_megapixels=np.inf)
     if camera.size != intrinsics.size:
         rgb = cv2.resize(rgb, camera.size, interpolation=cv2.INTER_AREA)
@@ -378,7 +405,7 @@ def _undistorted(
 
 
 def limited_view(view: PosedView) -> PosedView:
-    """Return a view whose longer side is at most `MAX_SIDE_PX`."""
+    """Return a view, scaled down if its longer side exceeds `MAX_SIDE_PX`."""
     return _scaled(view, min(1.0, MAX_SIDE_PX / max(view.camera.size)))
 
 

@@ -1,4 +1,4 @@
-"""Further file formats of a model: point clouds in UTM, maps, meshes, and inputs for splats."""
+"""Write a model in further formats: point clouds and maps in UTM, meshes, and inputs for splats."""
 
 from __future__ import annotations
 
@@ -26,30 +26,31 @@ from .splat import write_splat
 FormatName = Literal["laz", "map", "mesh", "splat", "text"]
 
 LAZ_STEP_M = 0.001
-"""Precision of the coordinates in LAZ files, in metres."""
+"""Coordinates in LAZ files are rounded to multiples of this, in metres."""
 
 MESH_MARGIN = 0.5
-"""A mesh leaves out points farther from the robust bounding box than this share of its size."""
+"""Meshing uses only points inside the robust bounding box, extended on each side by this fraction
+of its size."""
 
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
-"""The first two bound the depth of the octree, which grows with the number of points. The surface
-is trimmed where the octree is coarser than this depth by more than the third number of levels.
-Chosen by hand."""
+"""The depth of a mesh's octree grows with the number of points, between the two `MESH_DEPTHS`.
+Where points are sparse, the octree is coarser. Where it is more than `MESH_TRIM` levels above its
+full depth, the surface is cut away. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
-"""A mesh needs this number of points: with a handful, COLMAP's meshing crashes the process."""
+"""A mesh needs this number of points: with only a handful, COLMAP's meshing crashes the process."""
 
 COLORS = ("red", "green", "blue")
 
 POINTS_PER_CELL = 4.0
-"""Mean number of points in a cell of a map: few cells stay empty. Chosen by hand."""
+"""Cells of a map hold this number of points on average, so that few stay empty. Chosen by hand."""
 
 MAX_MAP_SIDE = 10_000
-"""A map has at most this number of cells across and down, which bounds memory and files."""
+"""A map has at most this number of rows and columns, which limits the memory and the file size."""
 
 
 def write_laz(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
-    """Write model.laz (LAS 1.4, format 7): the points in UTM, with colours of 16 bits."""
+    """Write model.laz (LAS 1.4, point format 7): the points in UTM, with 16-bit colours."""
     import laspy
     from pyproj import CRS
 
@@ -59,16 +60,17 @@ def write_laz(found: MultiViewReconstruction, folder: Path, output: Path) -> Non
     header.add_crs(CRS.from_epsg(epsg))
     las = laspy.LasData(header)
     las.x, las.y, las.z = xyz.T
-    # From 8 to 16 bits: 255 becomes 65535.
+    # Colours are scaled from 8 to 16 bits: 255 becomes 65535.
     las.red, las.green, las.blue = found.cloud.colors.astype(np.uint16).T * 257
     with atomic_path(output / "model.laz") as path, path.open("wb") as file:
         las.write(file, do_compress=True)
 
 
 def write_map(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
-    """Write height.tif, in metres, and orthophoto.tif: GeoTIFF in UTM, north up.
+    """Write height.tif (in metres) and orthophoto.tif, both as GeoTIFF in UTM with north up.
 
-    A cell has the height and colour of the median of its points; heights without points are NaN.
+    A cell takes height and colour from the point with the median height of its points. A cell
+    without points has the height NaN and the colour 0, which mean "no data".
     """
     xyz, epsg = _in_utm(found, "a map")
     low, high = np.percentile(xyz, (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
@@ -126,9 +128,9 @@ def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> No
     if len(cloud) < MIN_MESH_POINTS:
         raise ReconstructionError(
             f"a mesh needs at least {MIN_MESH_POINTS} dense points, and there are {len(cloud)}: "
-            "take more images, closer together, or leave out the format mesh"
+            "take more images, closer together, or leave out the format 'mesh'"
         )
-    # Points lie on surfaces, so their number grows with the square of the cells on a side.
+    # Points lie on surfaces, so N points need about sqrt(N) cells along a side of the octree.
     depth = round(float(np.clip(np.log2(np.sqrt(len(cloud))), *MESH_DEPTHS)))
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
         points, surface = Path(space) / "points.ply", Path(space) / "mesh.ply"
@@ -146,7 +148,11 @@ def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> No
 
 
 def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a mesh that COLMAP wrote: (N,) vertices with fields, and (M, 3) corners of triangles."""
+    """Read a PLY mesh that COLMAP wrote.
+
+    Returns the vertices, a structured array (N,) with fields such as "x" and "red", and the
+    triangles, (M, 3) indices of vertices.
+    """
     header, _, data = path.read_bytes().partition(b"end_header\n")
     counts = [int(number) for number in re.findall(rb"element \w+ (\d+)", header)]
     fields = re.findall(r"property (float|uchar) (\w+)", header.decode("ascii"))
@@ -159,12 +165,16 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Format(NamedTuple):
-    """A file format: its writer (model, folder of the images, output), its files, and packages."""
+    """A file format of a model.
+
+    `write` takes the model, the folder of the images and the output folder. `files` are the names
+    of the files that it writes, `packages` the Python packages that it needs.
+    """
 
     write: Callable[[MultiViewReconstruction, Path, Path], None]
     files: tuple[str, ...]
     packages: tuple[str, ...] = ()
-    placed: bool = False  # needs a georeferenced model
+    placed: bool = False  # whether it needs a georeferenced model
 
 
 FORMATS: dict[FormatName, Format] = {
@@ -177,7 +187,7 @@ FORMATS: dict[FormatName, Format] = {
 
 
 def check_formats(names: Sequence[FormatName]) -> None:
-    """Raise an error for an unknown format or a missing package before the long computation."""
+    """Raise an error if a format is unknown or one of its packages is missing."""
     for name in names:
         check_name("format", name, FORMATS)
         require_packages(f"the format {name}", *FORMATS[name].packages)

@@ -1,4 +1,4 @@
-"""Dense points: fusion of the depth maps of several images."""
+"""Fuse the depth maps of several images into dense points."""
 
 from __future__ import annotations
 
@@ -14,34 +14,41 @@ from ..geometry.camera import PosedView
 from .depth_maps import MIN_VIEWS, relative_projections
 
 MAX_ERROR_PX = 1.0
-"""A depth map agrees up to this reprojection error. Chosen by hand; COLMAP's fusion allows 2 px."""
+"""The depth map of a neighbour agrees with the depth of a pixel if the point of its own surface
+reprojects to within this distance of the pixel. Chosen by hand; COLMAP's fusion allows 2 px."""
 
 MAX_DEPTH_DIFFERENCE = 0.01
-"""Inverse depths agree, or belong to one surface, up to this relative difference. COLMAP's fusion
-also allows 1 %."""
+"""Two inverse depths agree, or belong to one surface, if they differ by at most this fraction.
+COLMAP's fusion also allows 1 %."""
 
 MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
-"""A pixel becomes a point, wherever it lies, if at least the second number of images agree on it.
-If fewer images cover it, all of them must agree, and at least the first number. Chosen by hand."""
+"""A pixel becomes a point, wherever it lies, if at least `ENOUGH_VIEWS` images agree on its depth.
+If the point is in the frame of fewer images than that, all of them must agree, and they must be at
+least `MIN_ALL_VIEWS`. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
-"""Pixels this near to a farther surface need `MIN_ALL_VIEWS` or `ENOUGH_VIEWS`. Windows there give
-the background the depth of the foreground in all images alike. Chosen by hand."""
+"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the strict
+rule of `MIN_ALL_VIEWS` and `ENOUGH_VIEWS`. There, matching windows give pixels of the background
+the depth of the foreground, in all images alike. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
-"""`MIN_VIEWS` images are enough in the middle of a surface, because most wrong points are on small
-patches. The middle is tested by 5 x 5 pixels at the first spacing. At least the second share of
-them must lie on the same surface, with `MIN_VIEWS` images that agree. Chosen by hand."""
+"""Pixels in the middle of a surface need only `MIN_VIEWS` images that agree, because most wrong
+points are on small patches. The middle is tested with 5 x 5 pixels that are `MIDDLE_SPACING_PX`
+apart: at least the fraction `MIN_MIDDLE_SHARE` of them must lie on the surface, and `MIN_VIEWS`
+images must agree on each of these. Chosen by hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
-"""The second number of images is enough within the first distance of a middle pixel of the same
-surface. Other images may not show this surface. Chosen by hand."""
+"""Pixels within `FILLED_RADIUS_PX` of the middle of their surface (see `MIN_MIDDLE_SHARE`) need
+only `MIN_FILLED_VIEWS` images that agree, because other images may not show this part of the
+surface. Chosen by hand."""
 
 MIN_TRIANGULATION_DEG = 1.0
-"""A point needs this angle between its two outermost lines of sight. Chosen by hand."""
+"""A point is kept only if the line of sight of at least one image that agrees on it differs by this
+angle from that of the reference image. Chosen by hand."""
 
 DUPLICATE_DEPTH = 0.01
-"""A point repeats an earlier one if their depths differ by a smaller share. Chosen by hand."""
+"""A point is dropped if an earlier one projects to the same pixel and their depths differ by at
+most this fraction. Chosen by hand."""
 
 DENSE_POINT = np.dtype(
     [
@@ -52,14 +59,15 @@ DENSE_POINT = np.dtype(
         ("views", np.uint8),
     ]
 )
-"""Dense point: position, unit normal towards the reference image, root mean square distance in
-pixels from the matches of the reference, sRGB colour, and number of images that agree on it."""
+"""A dense point, which comes from a pixel of the depth map of a reference image. `normals` is a
+unit vector towards the camera of this image. `errors` is the `error` of the pixel (see
+`DEPTH_PIXEL`). `colors` is sRGB. `views` is the number of images that agree on the point."""
 
 
 def fuse_depth_maps(
     views: Sequence[PosedView], maps: Sequence[np.ndarray], stride_px: int
 ) -> np.ndarray:
-    """Return the `DENSE_POINT`s of the first depth map on which enough of the others agree."""
+    """Return, as `DENSE_POINT`s, the pixels of the first map on which enough other maps agree."""
     from .dense_kernels import fuse_rows
 
     if len(maps) < MIN_FILLED_VIEWS:  # no neighbour has a depth map
@@ -84,7 +92,7 @@ def fuse_depth_maps(
     xy, near = np.column_stack([column, row]) * float(stride_px), inverse[row, column]
     fused = np.empty(len(row), DENSE_POINT)
     fused["points"] = (camera.rays(xy) / near[:, None] - views[0].translation) @ views[0].rotation
-    # The inverse depth of a plane at a pixel is normal . line of sight / distance of the plane.
+    # The inverse depth of a plane at a pixel is (normal . line of sight) / (distance of the plane).
     ahead = near - (plane[:, 1:] * (xy - camera.centre)).sum(axis=1)
     away = np.column_stack([plane[:, 1:] * camera.focal_px, ahead]) @ views[0].rotation
     fused["normals"] = -away / np.linalg.norm(away, axis=1, keepdims=True)
@@ -94,7 +102,11 @@ def fuse_depth_maps(
 
 
 def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px: int) -> np.ndarray:
-    """Return a mask of pixels on which enough images agree, `count` of the `shown` ones."""
+    """Return a mask of the pixels on which enough images agree.
+
+    `count` (H, W) is the number of images that agree, `shown` (H, W) the number of images whose
+    frame contains the point of the pixel.
+    """
     from .dense_kernels import support_rows
 
     def support(chosen: np.ndarray, reach: int, spacing: int) -> np.ndarray:
@@ -106,7 +118,7 @@ def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px:
     def pixels(length_px: int) -> int:
         return max(1, length_px // stride_px)
 
-    # Find the pixels just before a farther surface. The dilation ignores single pixels.
+    # Find the pixels on the near side of a depth edge. The dilation removes single far pixels.
     inverse, radius = planes[..., 0], pixels(EDGE_RADIUS_PX)
     known = cv2.dilate(np.where(inverse > 0, inverse, np.inf), np.ones((3, 3), np.uint8))
     farthest = cv2.erode(known, np.ones((2 * radius + 3,) * 2, np.uint8))
@@ -119,7 +131,7 @@ def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px:
 
 
 def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:
-    """Join the points of all reference images, without points that repeat earlier ones."""
+    """Join the points of all reference images, but drop those that repeat points joined earlier."""
     kept, boxes = [np.empty(0, DENSE_POINT)], [np.empty((0, 3))]
     for view, own in parts:
         near = (_may_show(view, box, stride_px) for box in boxes)
@@ -136,7 +148,10 @@ def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px:
 
 
 def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
-    """Return whether a box may be in view, with not all corners beyond one side of the frustum."""
+    """Return whether a view may show part of a box, given the box's corners (8, 3).
+
+    It cannot if all corners lie beyond one side of the frustum, widened by a margin.
+    """
     seen = (corners @ view.rotation.T + view.translation) @ view.camera.matrix.T
     xy, depth = seen[:, :2], seen[:, 2:]
     inside = [depth, xy + margin_px * depth, (np.array(view.camera.size) + margin_px) * depth - xy]
@@ -144,7 +159,7 @@ def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
 
 
 def nearest_depths(view: PosedView, parts: Sequence[np.ndarray], stride_px: int) -> np.ndarray:
-    """Return the depth of the nearest of (N, 3) points in each cell of a view, or infinity."""
+    """Return the least depth of the points in each cell of a view, or infinity in empty cells."""
     columns, rows = (-(-side // stride_px) for side in view.camera.size)
     nearest = np.full((rows, columns), np.inf)
     for points in parts:

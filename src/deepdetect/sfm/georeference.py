@@ -1,4 +1,4 @@
-"""Scale and place of a model: by GPS, ground control points, or a known distance."""
+"""Find the scale and place of a model by GPS, ground control points, or a known distance."""
 
 from __future__ import annotations
 
@@ -20,59 +20,69 @@ from .colmap import import_pycolmap
 from .mapping import SparseModel
 
 GPS_ACCURACY_M = 3.0
-"""Accuracy of GPS positions that state none, in metres. Usual receivers reach it in the open."""
+"""Accuracy in metres that is assumed for GPS positions that do not state theirs. Usual receivers
+reach it in the open."""
 
 CONTROL_ACCURACY_M = 0.1
-"""Accuracy in metres of control points, surveyed to centimetres and marked within a few pixels."""
+"""Accuracy in metres that is assumed for ground control points. They are surveyed to centimetres,
+and marked in the images to within a few pixels."""
 
 MIN_FIXES = 3
-"""Number of positions that must agree: with two, the rotation about their line is undetermined."""
+"""The fit needs at least this number of positions that agree: with two, the rotation about the line
+through them would be undetermined."""
 
 MAX_SCALE_STD = 0.25
-"""A model is georeferenced only if the relative standard deviation of its scale is smaller. This
-deviation is large if positions lie too close together for their accuracy. Chosen by hand."""
+"""A model is georeferenced only if the relative standard deviation of its scale is below this. The
+deviation is larger if the positions lie too close together for their accuracy. Chosen by hand."""
 
 MAX_HEADING_STD_DEG = 20.0
-"""A model is georeferenced only if north has a smaller standard deviation. Chosen by hand."""
+"""A model is georeferenced only if the standard deviation of its direction to north is below this.
+Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""An axis with a larger standard deviation by positions alone relies on the cameras' up."""
+"""If the positions alone leave the rotation about an axis with a larger standard deviation, a note
+says that this rotation relies on the assumption of upright cameras."""
 
 GRAVITY_STD_DEG = 2.0
-"""Standard deviation of the angles that a gimbal reports. Chosen by hand."""
+"""Standard deviation that is assumed for the angles of a gimbal. Chosen by hand."""
 
 UPRIGHT_STD_DEG, AHEAD_STD_DEG = 5.0, 25.0
-"""The rows of a photograph are assumed to be level, with the first standard deviation. The mean
-tilt of the optical axes is assumed to be 0, with the second. Chosen by hand."""
+"""Without a gimbal, the rows of a photograph are assumed to be level, with the standard deviation
+`UPRIGHT_STD_DEG`. The optical axes are assumed to be level on average, with the standard deviation
+`AHEAD_STD_DEG`. Chosen by hand."""
 
 DOWNWARD_SHARE = 0.1
-"""Weight of the optical axes in the estimate of up, relative to the columns of the images. Cameras
-look down more often than up. Chosen by hand."""
+"""Without a gimbal, "down" is first taken as the mean direction of the image columns plus this
+weight times the mean optical axis, because cameras look down more often than up. Chosen by hand."""
 
 MAX_DISTANCE_PX = 15.0
-"""A pixel given by the user stands for a point projected this close to it. Chosen by hand."""
+"""A pixel that the user gives as the end of a known distance stands for a point of the model that
+projects to within this distance of the pixel. Chosen by hand."""
 
-NEARLY_A_LINE = "they lie nearly on a line: the rotation of the model about it follows from the \
-assumption that cameras are held upright"
+NEARLY_A_LINE = "the positions lie nearly on a line: the rotation of the model about this line \
+follows from the assumption that the cameras are held upright"
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a model in WGS 84: its axes go east, north and up from here, in metres."""
+    """Origin of a model: WGS 84 latitude and longitude in degrees, and height in metres.
+
+    The axes of the model point east, north and up from here, in metres.
+    """
 
     latitude: float
     longitude: float
     height: float
 
     def to_enu(self, places: np.ndarray) -> np.ndarray:
-        """Convert (N, 3) latitudes, longitudes and heights to metres east, north and up."""
+        """Convert (N, 3) latitudes, longitudes, heights to metres east, north, up of the origin."""
         where = self.latitude, self.longitude, self.height
         return np.asarray(_ellipsoid().ellipsoid_to_enu(places, *where))
 
     def to_utm(self, enu: np.ndarray) -> tuple[np.ndarray, int]:
-        """Convert (N, 3) metres to the UTM zone of the origin; also return its EPSG number."""
+        """Convert (N, 3) metres to UTM in the origin's zone; also return the zone's EPSG number."""
         where = self.latitude, self.longitude, self.height
-        # pycolmap takes the zone of the first point.
+        # pycolmap uses the UTM zone of the first point, so the origin is put first.
         all_ = np.vstack([np.zeros((1, 3)), np.asarray(enu, np.float64)])
         found, zone = _ellipsoid().ellipsoid_to_utm(_ellipsoid().enu_to_ellipsoid(all_, *where))
         return np.asarray(found)[1:], (32600 if self.latitude >= 0 else 32700) + int(zone)
@@ -88,13 +98,16 @@ class Georeference:
     """Scale and place of a model, and how they were found.
 
     Attributes:
-        similarity: from the frame of the mapping to the world.
-        source: "GPS", "ground control points" or "known distance", which gives no place.
-        origin: origin of the world, whose axes go east, north and up; None without a place.
-        residuals: (3,) metres east, north and up from the model to each GPS position, by image, or
-            to each control point.
-        wrong: names of positions that contradict the others and were left out.
-        fit: the fitted similarity with its uncertainty.
+        similarity: similarity from the frame of the mapping to the world.
+        source: "GPS", "ground control points", or "known distance", which gives a scale but no
+            place.
+        origin: origin of the world, whose axes point east, north and up; None if only the scale is
+            known.
+        residuals: given position minus position in the model, (3,) in metres east, north and up, by
+            name of the image (GPS) or of the control point.
+        wrong: names of the images or control points whose positions contradict the others. These
+            positions were left out.
+        fit: the fitted similarity with its uncertainty; None for a known distance.
     """
 
     similarity: Similarity
@@ -105,7 +118,7 @@ class Georeference:
     fit: SimilarityFit | None = None
 
     def summary(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return the values as plain Python types for JSON."""
         if self.origin is None or self.fit is None:
             return {"source": self.source}
         good = np.array([r for name, r in self.residuals.items() if name not in self.wrong])
@@ -139,17 +152,18 @@ def georeference(
     control: Sequence[ControlRow] | None = None,
     scale_by: tuple[float, str, str] | None = None,
 ) -> Georeference | str:
-    """Find the scale and the place of a model, or return a sentence on why there is no scale.
+    """Find the scale and place of a model, or return a sentence on why even the scale is unknown.
 
     Args:
         sparse: the model.
-        points: (N, 3) dense points, which can also be ends of a distance.
+        points: (N, 3) dense points. The ends of the known distance may be dense or sparse points.
         folder: folder of the images.
-        control: ground control points, which take precedence over GPS.
-        scale_by: known distance as in `MultiViewOptions`; its scale takes precedence over both.
+        control: ground control points, which are used instead of GPS.
+        scale_by: known distance as in `MultiViewOptions`. Its scale is used instead of the one from
+            control points or GPS.
 
     Raises:
-        OptionError: the control points or the ends of the distance are not in the model.
+        OptionError: the model lacks an end of the distance, or has too few control points.
         ReconstructionError: the control points contradict the model.
     """
     scale = None
@@ -166,12 +180,12 @@ def georeference(
 
 
 def require_fixes(folder: Path, what: str) -> None:
-    """Raise an OptionError if too few images below a folder have GPS."""
+    """Raise an OptionError if fewer than `MIN_FIXES` images below a folder have a GPS position."""
     found = sum(read_gps(path) is not None for path in find_images(folder))
     if found < MIN_FIXES:
         raise OptionError(
-            f"{what} needs GPS in {MIN_FIXES} images, and {found} have it: leave the format out, "
-            "or give ground control points"
+            f"{what} needs {MIN_FIXES} images with a GPS position, and there are {found}: leave "
+            "the format out, or give ground control points"
         )
 
 
@@ -180,7 +194,7 @@ def require_images(
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
-    """Raise an OptionError if control points or the ends of a distance name unknown images."""
+    """Raise an OptionError if images lack an end of the distance, or enough control points."""
     names = [*names]
     named = {Path(name).name: name for name in names} | {name: name for name in names}
     if control is not None:
@@ -193,14 +207,16 @@ def require_images(
 def georeference_by_gps(
     views: Mapping[str, PosedView], folder: Path, scale: float | None = None
 ) -> Georeference:
-    """Find the place of a model by the GPS of its images below a folder.
+    """Find the place of a model by the GPS positions of its images, which are below a folder.
 
-    A known `scale` is in metres per unit of the model. Raises a ReconstructionError that says why
-    no place is found.
+    `scale` is in metres per unit of the model, or None if it is unknown. If no place is found, a
+    ReconstructionError says why.
     """
     fixes = {name: fix for name in views if (fix := read_gps(folder / name)) is not None}
     if len(fixes) < MIN_FIXES:
-        raise ReconstructionError(f"{len(fixes)} of the images have GPS, {MIN_FIXES} are needed")
+        raise ReconstructionError(
+            f"{len(fixes)} of the images have GPS, but {MIN_FIXES} are needed"
+        )
     places = np.array([(fix.latitude, fix.longitude, fix.altitude) for fix in fixes.values()])
     stated = [fix.accuracy_m for fix in fixes.values() if fix.accuracy_m is not None]
     accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M
@@ -245,11 +261,12 @@ def _place(
 def upright(
     views: Mapping[str, PosedView], gravities: Mapping[str, np.ndarray | None] = {}
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Estimate the direction of up from cameras; also return what `fit_similarity` takes as level.
+    """Estimate from the cameras which direction is up, and which directions are level.
 
-    Level directions are perpendicular to the gravity that a gimbal reports. Without a gimbal, the
-    rows of the photographs are assumed to be level and, less certainly, the optical axes. Returns
-    the unit vector up, the level vectors (L, 3) and their standard deviations (L,) in radians.
+    If a gimbal reports gravity, the directions perpendicular to it are level. Without a gimbal, the
+    rows of the photographs are assumed to be level and, less certainly, the optical axes. Returns a
+    unit vector up (3,) and, for `fit_similarity`, the level vectors (L, 3) and their standard
+    deviations (L,) in radians.
     """
     level, stds, down = [], [], []
     for name, view in views.items():
@@ -259,11 +276,11 @@ def upright(
             level += [*np.linalg.svd(down[-1][None])[2][1:]]
             stds += 2 * [GRAVITY_STD_DEG]
         else:
-            # All cameras may look up a little: more of them do not make their mean more certain.
+            # All cameras may be tilted alike, so more of them do not make the mean more certain.
             level += [view.rotation[0], view.rotation[2]]
             stds += [UPRIGHT_STD_DEG, AHEAD_STD_DEG * np.sqrt(len(views))]
     up = -np.mean(down, axis=0) if down else np.zeros(3)
-    if not down:  # as Brown and Lowe straighten panoramas: up is perpendicular to all rows
+    if not down:  # up is perpendicular to all rows, as in Brown and Lowe's panoramas
         across, *others = np.array([view.rotation for view in views.values()]).swapaxes(0, 1)
         above = -(others[0] + DOWNWARD_SHARE * others[1]).mean(axis=0)
         up = np.linalg.solve(across.T @ across / len(across) + 1e-3 * np.eye(3), above)
@@ -271,7 +288,7 @@ def upright(
 
 
 class ControlRow(NamedTuple):
-    """A ground control point in an image: its name, latitude, longitude, height, and pixel."""
+    """A ground control point in an image. `place` is its latitude, longitude and height."""
 
     name: str
     place: tuple[float, float, float]
@@ -282,8 +299,9 @@ class ControlRow(NamedTuple):
 def read_control_points(path: str | Path) -> list[ControlRow]:
     """Read a file of ground control points in the format of OpenDroneMap.
 
-    The first line is the coordinate system, such as "EPSG:32633" or "WGS84 UTM 33N". The others are
-    `x y z column row image [name]`.
+    The first line names the coordinate system, such as "EPSG:32633" or "WGS84 UTM 33N". Each other
+    line is `x y z column row image [name]`: a point's coordinates, its pixel in an image, the name
+    of the image, and perhaps that of the point.
     """
     require_packages("a file of ground control points", "pyproj")
     from pyproj import CRS, Transformer
@@ -303,10 +321,11 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
             rows.append(ControlRow((name or [f"{x} {y} {z}"])[0], place, image, xy))
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # from pyproj, or text in place of numbers
+    except Exception as error:  # an error of pyproj, or text in place of numbers
         raise OptionError(
-            f"{path} is not a file of ground control points ({first_line(error)}): write the "
-            "coordinate system, such as EPSG:32633, then lines of x y z column row image"
+            f"{path} is not a file of ground control points ({first_line(error)}): the first line "
+            "must be the coordinate system, such as EPSG:32633, and each other line 'x y z column "
+            "row image'"
         ) from None
     return rows
 
@@ -314,7 +333,7 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
 def georeference_by_control_points(
     sparse: SparseModel, control: Sequence[ControlRow], scale: float | None = None
 ) -> Georeference:
-    """Find the place of a model by control points that are marked in two or more of its images."""
+    """Find the place of a model by the control points marked in two or more of its images."""
     seen = _seen_by_several(control, _by_file_name(sparse.images))
     points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
     places = np.array([next(iter(rows.values())).place for rows in seen.values()])
@@ -326,7 +345,11 @@ def georeference_by_control_points(
 def _seen_by_several(
     control: Sequence[ControlRow], names: Mapping[str, str]
 ) -> dict[str, dict[str, ControlRow]]:
-    """Return observations by point and image, of points in two or more of the named images."""
+    """Return the control points that are marked in two or more of the named images.
+
+    The result maps the name of a point, and then the full name of an image, to the `ControlRow`.
+    `names` maps the names that control points may use for images to full names.
+    """
     seen: dict[str, dict[str, ControlRow]] = {}
     for row in control:
         if row.image in names:
@@ -334,15 +357,15 @@ def _seen_by_several(
     seen = {name: rows for name, rows in seen.items() if len(rows) > 1}
     if len(seen) < MIN_FIXES:
         raise OptionError(
-            f"{len(seen)} ground control points are marked in two or more images of the model, "
-            f"{MIN_FIXES} are needed: mark more, and name images by their files, with the folder "
-            "if two files have the same name"
+            f"{len(seen)} ground control points are marked in two or more images of the model, but "
+            f"{MIN_FIXES} are needed: mark more points, and name each image by its file, with the "
+            "folder if two files have the same name"
         )
     return seen
 
 
 def _by_file_name(names: Iterable[str]) -> dict[str, str]:
-    """Map the full names of images, and file names that only one of them has, to full names."""
+    """Map names that users may give (full names, and file names if unique) to full names."""
     names = [*names]
     counts = Counter(Path(name).name for name in names)
     alone = {Path(name).name: name for name in names if counts[Path(name).name] == 1}
@@ -350,7 +373,7 @@ def _by_file_name(names: Iterable[str]) -> dict[str, str]:
 
 
 def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.ndarray:
-    """Return the point (3,) nearest to the lines of sight of the observations."""
+    """Return the point (3,) that is nearest to the lines of sight of a control point's pixels."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for name, row in rows.items():
         view = sparse.images[name].view
@@ -365,10 +388,10 @@ def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.nda
 def scale_by_distance(
     distance_m: float, end0: str, end1: str, sparse: SparseModel, points: np.ndarray
 ) -> float:
-    """Return the metres per unit of a model, from a known distance of two cameras or points.
+    """Return the metres per unit of a model, from the known distance between two places in it.
 
-    An end is the name of an image, which stands for its camera, or NAME:X,Y, which stands for the
-    point of `points` (N, 3) at this pixel.
+    An end of the distance is the name of an image, which stands for the position of its camera, or
+    NAME:X,Y, which stands for the one of the `points` (N, 3) that this pixel of the image shows.
     """
     one, other = (_end(end, sparse, points) for end in (end0, end1))
     length = float(np.linalg.norm(one - other))
@@ -390,17 +413,19 @@ def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
             f"the model has no point within {MAX_DISTANCE_PX:g} pixels of {end}: name a pixel with "
             "more texture around it"
         )
-    # The nearest point to the camera hides others that are about as close to the pixel.
+    # If several points are about equally close to the pixel, the one nearest to the camera hides
+    # the others.
     near = np.flatnonzero(distances < distances.min() + 2)
     return np.asarray(points[near[depth[near].argmin()]], np.float64)
 
 
 def _image_and_pixel(end: str, names: Mapping[str, str]) -> tuple[str, np.ndarray | None]:
-    """Return the image that an end of a distance names, and the pixel, or None for a camera."""
+    """Return the image that an end of a distance names, and its pixel (None if none is given)."""
     pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", end)
     name = pixel[1] if pixel else end
     if name not in names:
         raise OptionError(
-            f"{name} is not an image of the model: name two of its images, or pixels as NAME:X,Y"
+            f"{name} is not an image of the model: name two of its images, or pixels in images as "
+            "NAME:X,Y"
         )
     return names[name], np.array([float(pixel[2]), float(pixel[3])]) if pixel else None

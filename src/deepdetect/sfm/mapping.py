@@ -1,7 +1,7 @@
-"""Poses of all images and sparse points: COLMAP's mapping and a last bundle adjustment.
+"""Estimate all poses and the sparse points by COLMAP's mapping and a last bundle adjustment.
 
-Schönberger and Frahm, "Structure-from-Motion Revisited", 2016; Pan, Baráth, Pollefeys and
-Schönberger, "Global Structure-from-Motion Revisited", 2024.
+Incremental mapping: Schönberger and Frahm, "Structure-from-Motion Revisited", 2016. Global mapping:
+Pan, Baráth, Pollefeys and Schönberger, "Global Structure-from-Motion Revisited", 2024.
 """
 
 from __future__ import annotations
@@ -23,59 +23,67 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
 MIN_VERIFIED = 30
-"""Number of inliers that the two-view geometry of a pair needs. COLMAP also registers images by 30.
-Some 20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
+"""A pair of images is used only if its two-view geometry has at least this number of inliers.
+COLMAP also needs 30 inliers to register an image. Some 20 of 8,192 keypoints agree by chance, and
+wrong pairs slow the mapping down tenfold."""
 
 MAX_VERIFICATION_ERROR_PX = 4.0
-"""An inlier has an error up to this, which is COLMAP's default."""
+"""A match is an inlier if its geometric error is at most this, which is COLMAP's default."""
 
 MAX_TRIALS = 5000
-"""RANSAC draws at most this number of samples for a pair. COLMAP's limit of 10,000 is reached
-mostly by pairs of different places. If many pairs are compared, it costs more time than the
-mapping."""
+"""RANSAC draws at most this number of samples for a pair of images. COLMAP's limit is 10,000, and
+mostly pairs that show different places reach it. If many pairs are compared, that limit costs more
+time than the mapping."""
 
 MIN_VIEWS = 3
-"""A model needs this number of images; `reconstruct` is for two."""
+"""A model needs at least this number of images. The function `reconstruct` is for two."""
 
 MAX_MODELS = 5
-"""Models are made of at most this number of unconnected components. Chosen by hand."""
+"""If matches do not connect all images, at most this number of connected components are mapped,
+each to a model of its own. Chosen by hand."""
 
 MAX_FIRST_PAIRS = 20
-"""Number of pairs with which the mapping of a component may try to begin. Chosen by hand."""
+"""The mapping tries at most this number of pairs of images to begin with. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
-"""Triangulation angle of the first pair in a second attempt, which also allows motion straight
-ahead. It follows if the first attempt, with COLMAP's 16 degrees and no such motion, finds no first
-pair, as in a clip from a car, or leaves out more images than it maps. Chosen by hand."""
+"""The mapping begins with a pair of images. In the first attempt, lines of sight to a point must
+form an angle of 16 degrees, as COLMAP asks, and the camera must not have moved straight ahead. The
+second attempt asks only for this angle, and allows such motion. It follows if the first one finds
+no pair, as in a clip from a car, or leaves out more connected images than it maps. Chosen by
+hand."""
 
 ROBUST_SCALE_PX = 1.0
-"""Scale of the Cauchy loss of the last adjustment: larger errors count less. Chosen by hand."""
+"""Scale of the Cauchy loss in bundle adjustment: larger errors count less. Chosen by hand."""
 
 MAX_REFINED_ERROR_PX = 1.0
-"""Refined tracks lose observations with a larger error: such a patch shows something else."""
+"""Observations of refined tracks with a larger reprojection error are removed, because such a patch
+shows something else."""
 
 ROUGH_TOLERANCE, TOLERANCE = 1e-6, 1e-8
-"""An adjustment ends if a step reduces the cost by a smaller fraction. The first is for the
-adjustment before wrong tracks are left out, the second for the last one. Smaller tolerances move
-cameras by under a thousandth of their error, and take four times as long."""
+"""A bundle adjustment ends when a step reduces the cost by less than this fraction.
+`ROUGH_TOLERANCE` is for the adjustment before wrong observations are removed, `TOLERANCE` for the
+last one. Smaller tolerances move cameras by under a thousandth of their error, and take four times
+as long."""
 
 MIN_ANGLE_DEG = 1.0
-"""A point needs two lines of sight at this angle. Chosen by hand; COLMAP asks for 1.5 degrees."""
+"""A point is kept only if two of its lines of sight form at least this angle. Chosen by hand;
+COLMAP asks for 1.5 degrees."""
 
 MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION = 0.1, 10.0, 1.0
-"""COLMAP's bounds of the focal length relative to the longer side, and of distortion parameters."""
+"""COLMAP's limits for plausible cameras: the first two for the focal length divided by the longer
+side, the third for the absolute values of the distortion parameters."""
 
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
-"""Principal points are estimated if each camera took at least this number of images. Otherwise they
-are the middle of the image. Chosen by hand."""
+"""The principal points of unknown cameras are estimated only if each camera took at least this
+number of images. Otherwise they are the middle of the image. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
-    """An image with its pose and the points that it sees.
+    """An image with its pose and the sparse points that it sees.
 
-    `points` (K,) are ascending indices of points, and `xy` (K, 2) their positions in pixels of the
-    pinhole camera of `view`.
+    `points` (K,) are ascending indices of the model's points. `xy` (K, 2) are the keypoints that
+    see them, in undistorted pixels, those of the pinhole camera of `view`.
     """
 
     view: PosedView
@@ -88,8 +96,9 @@ class RegisteredImage:
 class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
-    Images are in COLMAP's order. Points are (P, 3), their sRGB colours (P, 3) uint8, their mean
-    reprojection errors (P,) in pixels. `tracks` (P,) is the number of images that see each point.
+    `images` are by name, in COLMAP's order. `points` (P, 3) are positions, `colors` (P, 3) uint8
+    sRGB, and `errors` (P,) the mean reprojection errors of points in pixels. `tracks` (P,) is the
+    number of images that see each point.
     """
 
     images: Mapping[str, RegisteredImage]
@@ -100,18 +109,21 @@ class SparseModel:
 
     @property
     def views(self) -> dict[str, PosedView]:
-        """Cameras by name of the image."""
+        """The posed camera of each image, by name of the image."""
         return {name: image.view for name, image in self.images.items()}
 
     def common_points(self, image: RegisteredImage) -> list[int]:
-        """Count the points that each image of the model shares with the given one."""
+        """Count, for each image of the model, the points that it shares with the given image."""
         seen = np.zeros(len(self.points), bool)
         seen[image.points] = True
         return [int(seen[other.points].sum()) for other in self.images.values()]
 
 
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
-    """Store the two-view geometries of matched pairs; return the inlier counts of sound ones."""
+    """Verify matched pairs by their two-view geometry, and store it in the database.
+
+    Returns the number of inliers of each pair that has at least `MIN_VERIFIED`.
+    """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_VERIFIED)
         how.ransac.max_error = MAX_VERIFICATION_ERROR_PX
@@ -134,10 +146,11 @@ def map_images(
     seed: int = 0,
     registered: Callable[[int], object] = lambda count: None,
 ) -> tuple[Any, list[frozenset[str]]]:
-    """Estimate the poses of all images that are connected, from a database of verified pairs.
+    """Estimate the poses of connected images one after the other, from verified pairs.
 
-    Known cameras stay fixed. `registered` is called with the number of images just added. Returns
-    the largest `pycolmap.Reconstruction`, and the names in each other component.
+    With `known_cameras`, all intrinsics stay fixed. `registered` is called with the number of
+    images just added. Returns the largest `pycolmap.Reconstruction` and, for each other component
+    that was mapped, the names of its images.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
@@ -150,7 +163,7 @@ def map_images(
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
-            how.max_focal_length_ratio = np.inf  # a telescope may exceed COLMAP's limit
+            how.max_focal_length_ratio = np.inf  # COLMAP's limit is too low for telescopes
         found, tried = list[Any](), list[Any]()
         for forward in (False, True):
             if forward:
@@ -169,7 +182,8 @@ def map_images(
             attempt = _sound(models, known_cameras)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
-            # The rest may form a larger component, such as a drive in a folder with a house.
+            # The images left out may form a larger component. A folder may, for example, hold a
+            # clip of a drive and photographs of a house.
             mapped = frozenset[str]().union(*map(_names, found))
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
             if found and largest_component(left) <= _size(found[0]):
@@ -180,7 +194,7 @@ def map_images(
 def map_globally(
     database: Path, folder: Path, known_cameras: bool, seed: int = 0
 ) -> tuple[Any, list[frozenset[str]]]:
-    """Estimate the poses of all images at once; arguments and results as in `map_images`."""
+    """Estimate the poses of all images at once. Arguments and results are as in `map_images`."""
     with quiet_pycolmap() as pycolmap, tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
         how = pycolmap.GlobalPipelineOptions()
         how.min_model_size, how.min_num_matches, how.random_seed = MIN_VIEWS, MIN_VERIFIED, seed
@@ -194,8 +208,9 @@ def map_globally(
 def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
     """Return the models, largest first, without those whose estimated cameras are implausible.
 
-    With few points, focal length and distortion may diverge until COLMAP can triangulate nothing
-    in most images. Known cameras cannot diverge.
+    A model is left out if more than half of its images have implausible cameras. With few points,
+    focal length and distortion may diverge until COLMAP can triangulate nothing in most images.
+    Known cameras cannot diverge, because they are fixed.
     """
     limits = MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION
     found = []
@@ -208,19 +223,20 @@ def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
 
 
 def _largest(found: Sequence[Any], tried: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
-    """Return the first of the sound models, and the names in the others.
+    """Return the largest model, and the names of the images in each other model.
 
-    Raises a NoDepthError if no model is sound; the models that were `tried` decide on its message.
+    `found` are the sound models, largest first. If there are none, a NoDepthError says why: either
+    all models that were `tried` have implausible cameras, or the images do not overlap enough.
     """
     if not found and any(_size(model) >= MIN_VIEWS for model in tried):
         raise NoDepthError(
             "focal length and distortion cannot be estimated from these images: give `calibration` "
-            "or `focal_px`, or take more images, also from the side"
+            "or `focal_px`, or take more images, also from other sides"
         )
     if not found or _size(found[0]) < MIN_VIEWS:
         raise NoDepthError(
-            "the images do not overlap enough to be connected: take each from another place, so "
-            "that it shows most of what the one before shows"
+            "the images do not overlap enough to be connected: take each image from a new place, "
+            "but so that it shows most of what the previous image shows"
         )
     return found[0], [_names(model) for model in found[1:]]
 
@@ -234,7 +250,7 @@ def _names(model: Any) -> frozenset[str]:
 
 
 def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseModel:
-    """Convert a `pycolmap.Reconstruction`; `sources` name the origin of intrinsics, by image."""
+    """Convert a `pycolmap.Reconstruction`; `sources` gives `CameraIntrinsics.source` by image."""
     points = np.empty((len(model.points3D), 3))
     colors = np.empty(points.shape, np.uint8)
     row_of = {}
@@ -261,7 +277,10 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
 
 
 def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> None:
-    """Bundle-adjust a model with a robust loss. pycolmap's own function cannot turn off its log."""
+    """Bundle-adjust a model with a robust loss.
+
+    pycolmap's ready-made function is not used, because its log cannot be turned off.
+    """
     taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     enough = min(taken.values()) >= MIN_VIEWS_OF_PRINCIPAL_POINT
     with quiet_pycolmap() as pycolmap:
@@ -282,7 +301,7 @@ def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> Non
 
 
 def adjust_refined(model: Any, known_cameras: bool) -> None:
-    """Bundle-adjust a model with refined tracks twice, removing wrong observations before each."""
+    """Bundle-adjust a model with refined tracks twice. Remove wrong observations before each."""
     for max_error_px, tolerance in (
         (MAX_VERIFICATION_ERROR_PX, ROUGH_TOLERANCE),
         (MAX_REFINED_ERROR_PX, TOLERANCE),
@@ -293,7 +312,7 @@ def adjust_refined(model: Any, known_cameras: bool) -> None:
 
 
 def normalise_model(model: Any) -> None:
-    """Give a model the frame of the camera that sees most points, and `camera_spacing` as unit."""
+    """Make the camera that sees most points the frame of a model, and `camera_spacing` its unit."""
     sparse = read_sparse_model(model)
     view = max(sparse.images.values(), key=lambda image: len(image.points)).view
     centres = np.array([each.centre for each in sparse.views.values()])

@@ -1,8 +1,9 @@
-"""Detection and correction of images to which the mapping gave a wrong pose.
+"""Find and correct images to which the mapping gave a wrong pose.
 
 An image that is registered early is placed by few points. If the camera moves straight ahead,
-matches that are wrong along its path agree with many places on the path. A wrong place then stays,
-because points whose depth comes from this image agree with it. Other points show the error.
+wrong matches along its path agree with many places on the path, and the image may get a wrong one.
+It then stays there, because points whose depth comes from this image agree with the wrong place.
+Points whose depth comes from other images show the error.
 """
 
 from __future__ import annotations
@@ -21,20 +22,23 @@ from .colmap import quiet_pycolmap
 from .mapping import MAX_VERIFICATION_ERROR_PX, MIN_ANGLE_DEG, MIN_VERIFIED, adjust
 
 MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
-"""A point tests an image only if the other images' lines of sight to it spread by this root mean
-square angle about their mean. With less, the tested image itself gave the point its depth."""
+"""A point is used to test an image only if the lines of sight of the other images to this point
+spread about their mean by at least this angle (root mean square). If they spread less, the point
+got its depth from the tested image itself."""
 
 MIN_GAIN = 1.5
-"""An image is moved to another pose if at least this many times as many points agree with that pose
-as with the pose in the model. The ratio was within 1 % of 1 for images in their right place, and 3
-or more for misplaced ones."""
+"""An image is moved to a new pose if the number of points that agree with the new pose is at least
+this multiple of the number that agree with the old pose. The ratio was within 1 % of 1 for images
+in their right place, and 3 or more for misplaced ones."""
 
 MAX_ROUNDS = 3
-"""Number of rounds of checks. Corrected images give better points for checking other images."""
+"""Images are checked in at most this number of rounds. After each round, the corrected images give
+better points for checking the other images."""
 
 MIN_KEPT = 0.9
-"""A correction is undone if the new points keep a smaller fraction of the observations. The
-fraction was 0.99 where a correction helped."""
+"""All points are triangulated again after a correction. The correction is undone if the new points
+have less than this fraction of the observations that the old ones had. The fraction was 0.99 where
+a correction helped."""
 
 
 def correct_places(
@@ -45,10 +49,10 @@ def correct_places(
     seed: int = 0,
     quiet: bool = True,
 ) -> Any:
-    """Return a `pycolmap.Reconstruction` in which misplaced images are moved to their right pose.
+    """Return a `pycolmap.Reconstruction` in which misplaced images have been moved to better poses.
 
-    The database is that of the mapping. If an image is moved, all points are triangulated again,
-    and cameras and points adjusted. `quiet` shows no progress bar.
+    `database` is the one that the mapping used. If an image is moved, all points are triangulated
+    again, and a bundle adjustment follows. With `quiet`, no progress bar is shown.
     """
     for _ in range(MAX_ROUNDS):
         with quiet_pycolmap() as pycolmap:
@@ -72,7 +76,7 @@ def correct_places(
 def _better_places(
     pycolmap: Any, model: Any, database: Path, seed: int, quiet: bool
 ) -> dict[int, Any]:
-    """Return the poses, by image number, that points of other images support better."""
+    """Return better poses, by image number: with them, more points of other images agree."""
     how = pycolmap.AbsolutePoseEstimationOptions()
     how.ransac.max_error, how.ransac.random_seed = MAX_VERIFICATION_ERROR_PX, seed
     points, found = _Points(model), {}
@@ -98,12 +102,12 @@ def _better_places(
 
 
 class _Points:
-    """The points of a model, and which images see them.
+    """The points of a model, and which keypoints of which images see them.
 
     Attributes:
-        xyz: (P, 3) positions.
-        keypoints: (K, 2) pixels of all keypoints, by image.
-        seen: (K,) row of the point that each keypoint sees, or -1, by image.
+        xyz: (P, 3) positions of the points.
+        keypoints: (K, 2) pixels of all keypoints of an image, by image number.
+        seen: (K,) index of the point that each keypoint of an image sees, or -1, by image number.
     """
 
     def __init__(self, model: Any) -> None:
@@ -111,7 +115,7 @@ class _Points:
         places = [point.xyz for point in model.points3D.values()]
         self.xyz = np.array(places).reshape(-1, 3)
         self.keypoints, self.seen, self._sights = {}, {}, {}
-        # Number and sum of the lines of sight of all images that see a point.
+        # For each point, the number and the sum of the lines of sight of the images that see it.
         self._counts, self._sums = np.zeros(len(self.xyz)), np.zeros_like(self.xyz)
         for number in model.reg_image_ids():
             image = model.images[number]
@@ -128,15 +132,16 @@ class _Points:
     def matched(
         self, number: int, matches: Iterable[tuple[int, np.ndarray]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Match keypoints of an image to points that other images determine; return rows of both.
+        """Match the keypoints of an image to the points whose depth other images determine.
 
-        `matches` are numbers of other images, each with (M, 2) rows of keypoints of both images.
+        `matches` are numbers of other images, each with (M, 2) indices of matching keypoints in
+        this image and in the other. Returns indices of keypoints, and those of their points.
         """
         own, sights = self._sights[number]
         counts, sums = self._counts.copy(), self._sums.copy()
         counts[own] -= 1
         sums[own] -= sights
-        # The mean of unit vectors is shorter, the wider they spread.
+        # The wider unit vectors spread, the shorter is their mean.
         lengths = np.linalg.norm(sums, axis=1) / np.maximum(counts, 1)
         well = (counts > 1) & (lengths < np.cos(np.radians(MIN_SPREAD_DEG)))
         found = [np.empty(0, np.int64)]
@@ -149,7 +154,7 @@ class _Points:
 
 
 def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int, list[int]]:
-    """Return the images with which each image has verified matches."""
+    """Return, for each image, the images with which it has verified matches, all by number."""
     partners = defaultdict[int, list[int]](list)
     for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair)
@@ -160,13 +165,13 @@ def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int,
 
 
 def _matches(database: Any, number: int, other: int) -> np.ndarray:
-    """Return the inlier matches of two images, (M, 2) rows of keypoints."""
+    """Return the inlier matches of two images, (M, 2) indices of keypoints."""
     matches = database.read_two_view_geometry(number, other).inlier_matches
     return np.asarray(matches, np.int64).reshape(-1, 2)
 
 
 def _agreeing(camera: Any, xy: np.ndarray, points: np.ndarray, pose: Any) -> int:
-    """Count the points (K, 3) that a camera at a pose sees at their keypoints (K, 2)."""
+    """Count the points (K, 3) that a camera with this pose sees at their keypoints `xy` (K, 2)."""
     local = points @ pose.rotation.matrix().T + pose.translation
     errors = np.linalg.norm(camera.img_from_cam(local) - xy, axis=1)
     return int(((errors < MAX_VERIFICATION_ERROR_PX) & (local[:, 2] > 0)).sum())

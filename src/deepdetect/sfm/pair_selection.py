@@ -1,4 +1,4 @@
-"""Which images are connected by matches, and which show nothing new."""
+"""Find which images are connected by matches, and which show nothing new."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from ..batch.pair_list import Pair
 
 MIN_MATCHED = 0.5
-"""Two images are taken to differ unless this fraction of the keypoints is matched, in the image
-that has fewer. Chosen by hand."""
+"""Two images are taken to show different things unless at least this fraction of the keypoints is
+matched, counted in the image that has fewer keypoints. Chosen by hand."""
 
 
 def largest_component(pairs: Sequence[Pair]) -> int:
-    """Return the number of images in the largest connected component of a graph of pairs."""
+    """Return the number of images in the largest group that pairs connect, directly or not."""
     components: list[set[str]] = []
     for pair in pairs:
         touched = [names for names in components if not names.isdisjoint(pair)]
@@ -26,8 +26,9 @@ def largest_component(pairs: Sequence[Pair]) -> int:
 def motion(first: np.ndarray, second: np.ndarray, matches: np.ndarray) -> float:
     """Return the median motion of matched keypoints in pixels, or infinity if few are matched.
 
-    Keypoints are (N, 2) and (M, 2) pixels of two images, matches (K, 2) rows of both. With few
-    matches, most may lie on something fixed to the frame, such as a bonnet or a time stamp.
+    `first` (N, 2) and `second` (M, 2) are the keypoints of two images in pixels, `matches` (K, 2)
+    indices of keypoints in the first and the second image. If there are few matches, most of them
+    may lie on something fixed to the camera, such as a car's bonnet or a time stamp.
     """
     if len(matches) < MIN_MATCHED * min(len(first), len(second)):
         return np.inf
@@ -41,8 +42,9 @@ def thin_out(
 
     Args:
         names: all images in order.
-        near: pairs of images that show nearly the same, with their distance.
-        dropped: images left out before, each with the image kept in its place, which stays.
+        near: pairs of images that show nearly the same, with the motion between them in pixels.
+        dropped: images left out by earlier calls, each with the image that was kept in its place.
+            The images kept then are also kept in this call.
     """
     partners: dict[str, dict[str, float]] = {name: {} for name in names}
     for (first, second), distance in near.items():

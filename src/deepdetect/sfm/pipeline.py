@@ -1,7 +1,7 @@
-"""Reconstruction of many images: cameras, sparse and dense points.
+"""Reconstruct the cameras, sparse points and dense points of many images.
 
 Features and matches come from `batch`, poses from COLMAP. The results of each stage are kept in the
-output folder, so the same call continues an interrupted run, also with more images.
+output folder. So the same call continues an interrupted run, even if images have been added.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ from .splat import write_transforms
 from .stages import WORK, MultiViewOptions, Stages, check_images
 
 MAX_KEYPOINTS = 8192
-"""Default number of keypoints of an image. Chosen by hand."""
+"""An image gets at most this number of keypoints by default. Chosen by hand."""
 
 MIN_KEYPOINTS = 15
-"""Images with fewer keypoints are left out: they cannot be matched. Chosen by hand."""
+"""Images with fewer keypoints are left out, because they cannot be matched. Chosen by hand."""
 
 
 @suggest_keywords
@@ -67,17 +67,17 @@ def reconstruct_many(
 
     Writes into the folder `output`: model.ply, model.glb, model.html (a viewer, with the cameras),
     model.json, transforms.json (for nerfstudio), sparse/0 and database.db (for COLMAP), and work/
-    with intermediate results. If the images have GPS, the model is in metres east, north and up.
-    The same call continues an interrupted run. It starts processes, so a script must call it under
-    `if __name__ == "__main__":`.
+    with intermediate results. If three images have GPS, the model is in metres east, north and up.
+    The same call continues an interrupted run. The function starts processes, so a script must call
+    it under `if __name__ == "__main__":`.
 
     Args:
         images: a folder, or image files.
         output: folder for the results.
-        detector: detector of the keypoints. None: a `PointDetector` of 8,192 points.
+        detector: detector of the keypoints; by default a `PointDetector` of 8,192 points.
         selection: which keypoints are kept, as in `extract_features`.
-        calibration: file of the cameras, which are kept fixed. A `Calibration` or a `Camera` also
-            works. Without one, focal length and distortion are estimated.
+        calibration: known cameras, which are kept fixed: a calibration file, a `Calibration` or a
+            `Camera`. By default, focal length and distortion are estimated.
         focal_px: rough focal length of all images in pixels; by default from EXIF, or a guess.
         seed: seed of all random choices; COLMAP's threads may still cause small differences.
         options: options of all stages.
@@ -86,12 +86,13 @@ def reconstruct_many(
         quiet: show no progress bars.
 
     Returns:
-        Cameras and points. `unregistered` lists the images left out, with the reason.
+        Cameras and points. `unregistered` gives the images left out, each with the reason.
 
     Raises:
         ImageError: the folder is missing or holds no image.
         OptionError: an option is unknown or out of range, or differs from that of an earlier run.
-        ReconstructionError: fewer than three images can be read or, as `NoDepthError`, connected.
+        ReconstructionError: fewer than three images can be used.
+        NoDepthError: the images do not overlap enough, or do not determine depth.
         MissingExtraError: pycolmap or h5py is not installed.
 
     Example:
@@ -104,7 +105,7 @@ def reconstruct_many(
     detector = PointDetector(MAX_KEYPOINTS) if detector is None else detector
     if overwrite:
         work = target / WORK
-        if any(work.glob("features.h5*")):  # else it is another program's folder of this name
+        if any(work.glob("features.h5*")):  # else it is another program's folder
             shutil.rmtree(work, ignore_errors=True)
     stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
@@ -120,7 +121,7 @@ def reconstruct_many(
         unregistered[name] = f"it shows nearly the same as {other}"
         del sizes[name]
     if alike and len(sizes) < MIN_VIEWS:
-        raise NoDepthError(f"all images but {len(sizes)} show nearly the same: move the camera")
+        raise NoDepthError(f"all images except {len(sizes)} show nearly the same: move the camera")
     intrinsics = initial_intrinsics(folder, sizes, known, focal_px, options.single_camera)
     with timer.stage("mapping"):
         model, verified, components = stages.map(folder, intrinsics, matches, bool(known))
@@ -177,7 +178,7 @@ def _check_arguments(
     focal_px: float | None,
     options: MultiViewOptions,
 ) -> list[ControlRow] | None:
-    """Check the arguments before hours of work; return the ground control points, if any."""
+    """Check the arguments before the long computation; return the ground control points, if any."""
     import_pycolmap()
     check_formats(options.formats)
     control = read_control_points(options.control_points) if options.control_points else None
@@ -199,11 +200,14 @@ def _usable_images(
     calibration: Camera | Calibration | str | Path | None,
     unregistered: dict[str, str],
 ) -> tuple[dict[str, tuple[int, int]], Mapping[str, Camera]]:
-    """Return sizes and cameras of usable images; add reasons for others to `unregistered`."""
+    """Return the sizes of the images that can be used, and their cameras as far as known.
+
+    Adds every other image to `unregistered`, with the reason.
+    """
     for name, count in keypoints.items():
         if count < MIN_KEYPOINTS:
             unregistered[name] = (
-                f"it has {count} keypoints: it is black, blurred, or shows nothing with texture"
+                f"it has only {count} keypoints: it is black, blurred, or has no texture"
             )
     sizes = {name: size for name, size in sizes.items() if keypoints[name] >= MIN_KEYPOINTS}
     known: Mapping[str, Camera] = {}
@@ -212,27 +216,27 @@ def _usable_images(
         for name, (width, height) in sizes.items():
             if name not in known:
                 unregistered[name] = (
-                    f"it is {width}x{height} pixels, and the calibration is for another size: "
+                    f"it is {width}x{height} pixels, but the calibration is for another size: "
                     "give images of one size"
                 )
         sizes = {name: sizes[name] for name in known}
     if len(sizes) < MIN_VIEWS:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in [*unregistered.items()][:3])
         raise ReconstructionError(
-            f"{len(sizes)} of {len(sizes) + len(unregistered)} images can be used, "
+            f"{len(sizes)} of {len(sizes) + len(unregistered)} images can be used, but "
             f"{MIN_VIEWS} are needed: {reasons or 'take more images'}"
         )
     return sizes, known
 
 
 def check_output_folder(output: Path) -> None:
-    """Raise an OptionError if the output is not the name of a folder."""
+    """Raise an OptionError if `output` is the name of a file instead of a folder."""
     if output.is_file() or output.suffix.lower() in (".ply", ".glb", ".html"):
         raise OptionError(f"{output} is the name of a file: give the name of a folder with -o")
 
 
 def output_files(output: Path, formats: Sequence[FormatName] = ()) -> tuple[Path, ...]:
-    """Return the paths of all results in the output folder; the last one is `WORK`."""
+    """Return the paths of all results in the output folder. The last one is the folder `WORK`."""
     names = (
         *("model.ply", "model.glb", "model.html", "model.json", "transforms.json"),
         *("sparse", "database.db"),
@@ -244,7 +248,7 @@ def output_files(output: Path, formats: Sequence[FormatName] = ()) -> tuple[Path
 def _write(
     found: MultiViewReconstruction, folder: Path, output: Path, formats: Sequence[FormatName]
 ) -> None:
-    """Write the files of the model, and then the further formats, some of which may fail."""
+    """Write the files of the model, then each further format, even if another format has failed."""
     notes = {
         "title": f"{len(found.views)} images",
         "images": f"{len(found.views)} of {len(found.views) + len(found.unregistered)}",
@@ -279,7 +283,7 @@ def _write(
 def _seen_from(
     view: PosedView, found: MultiViewReconstruction
 ) -> tuple[PointCloud, list[PosedView]]:
-    """Return the points and cameras in the frame of one of the cameras, for the HTML viewer."""
+    """Return the points and cameras, in the frame of the camera `view`, for the HTML viewer."""
     frame = f"camera of {view.name}"
     points = found.cloud.points @ view.rotation.T + view.translation
     cameras = [each.relative_to(view) for each in found.views.values()]
@@ -293,17 +297,20 @@ def _why_unregistered(
     for names in components:
         if name in names:
             return (
-                f"it is connected with only {len(names) - 1} others, which overlap too little with "
-                "the rest"
+                f"it is connected with only {len(names) - 1} other images, and these overlap too "
+                "little with the rest"
             )
     if partners := sum(name in pair for pair in verified):
-        return f"it matches {partners} others, but they give no pose: take more images in between"
-    return "it matches no other image: it shows something else, or from too far away"
+        return (
+            f"it matches {partners} other images, but the matches give no pose: take more images "
+            "in between"
+        )
+    return "it matches no other image: it shows something else, or was taken from too far away"
 
 
 def _without_registered(
     components: Iterable[frozenset[str]], unregistered: Iterable[str]
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the names in other components, largest first, without registered images."""
+    """Return the unregistered images in each component, if two or more, largest component first."""
     left = [tuple(sorted(names & frozenset(unregistered))) for names in components]
     return tuple(sorted((names for names in left if len(names) > 1), key=len, reverse=True))

@@ -14,7 +14,7 @@ from ..geometry.point_cloud import PointCloud
 from .colmap import CameraIntrinsics
 from .georeference import Georeference
 
-SCALE = "lengths are in spacings, the median distance from a camera to its nearest neighbour: the \
+SCALE = "lengths are in units of the median distance from a camera to its nearest neighbour: the \
 true scale is unknown because"
 
 
@@ -22,31 +22,33 @@ true scale is unknown because"
 class MultiViewReconstruction:
     """Cameras and points of many images.
 
-    The world is the frame of the camera of `reference`: x right, y down, z forward. The unit is the
-    median distance from a camera to its nearest neighbour, or a metre if `scale_by` gave a length.
-    If GPS or ground control points place the model, its axes are east, north and up in metres.
+    The world frame is that of the camera of the image `reference`: x right, y down, z forward. The
+    unit is the median distance from a camera to its nearest neighbour, or a metre if `scale_by`
+    gave a length. If GPS or ground control points place the model, its axes point east, north and
+    up instead, in metres.
 
     Attributes:
         views: poses of the registered images, by name, with pinhole cameras.
         intrinsics: intrinsics of the same cameras, with their distortion.
         unregistered: reasons why the other images are not registered, by name.
-        components: names of unregistered images that are connected with each other, the largest
-            component first: each can be reconstructed alone.
-        reference: name of the image that sees most points. Its camera is the world's frame unless
-            the model has a place.
-        georeference: scale and place of the model, or a sentence on why it lacks them.
-        sparse: points by which the poses were estimated.
+        components: groups of unregistered images that are connected with each other, as tuples of
+            names, the largest group first. Each group can be reconstructed by itself.
+        reference: name of the image that sees most points. Its camera is the world frame unless
+            GPS or ground control points place the model.
+        georeference: scale and place of the model, or a sentence on why they are unknown.
+        sparse: points from which the poses were estimated.
         sparse_errors: (N,) float32 mean reprojection errors of these points in pixels.
-        sparse_views: (N,) int32 numbers of images that see each of these points.
+        sparse_views: (N,) int32 number of images that see each of these points.
         dense: dense points; empty if the options asked for none.
-        dense_errors: (M,) float32 root mean square distances in pixels to matches in other images.
-        dense_views: (M,) uint8 numbers of images that agree on each dense point.
+        dense_errors: (M,) float32 errors of the dense points: root mean square distance, in pixels,
+            between a point's projections to other images and its matches there.
+        dense_views: (M,) uint8 number of images that agree on each dense point.
         keypoints: number of keypoints, by image.
         matched: number of verified matches, by pair.
         pairs: number of pairs that were matched.
-        pair_choice: choice of the pairs: "exhaustive", "sequential:10" or "similar".
-        seconds: time of each stage of this run; a stage that an earlier run had finished takes 0.
-        files: files that were written.
+        pair_choice: how the pairs were chosen, such as "exhaustive", "sequential:10" or "similar".
+        seconds: time that each stage took in this run, about 0 if an earlier run had finished it.
+        files: files and folders that were written.
     """
 
     views: Mapping[str, PosedView]
@@ -86,7 +88,7 @@ class MultiViewReconstruction:
         return np.array([view.centre for view in self.views.values()]).reshape(-1, 3)
 
     def summary(self) -> dict[str, Any]:
-        """Return everything except the arrays as plain values for JSON."""
+        """Return everything except the arrays of points, as plain Python types for JSON."""
         return {
             "images": len(self.views) + len(self.unregistered),
             "registered": len(self.views),

@@ -1,4 +1,4 @@
-"""Inputs for the training of radiance fields and Gaussian splats: images, cameras, points."""
+"""Write inputs for the training of radiance fields and Gaussian splats: images, cameras, points."""
 
 from __future__ import annotations
 
@@ -20,26 +20,30 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .result import MultiViewReconstruction
 
 SPLAT_POINTS = 200_000
-"""The initial cloud has at most this number of dense points; trainers add some. Chosen by hand."""
+"""Training starts from at most this number of dense points. Trainers add more. Chosen by hand."""
 
 JPEG_QUALITY = 95
 
 CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
-"""The first are sides, in pixels, of the square that a point covers in a depth map. The smallest
-side is taken for which the next one covers less than the second times as much: few gaps are left.
-Chosen by hand."""
+"""A point covers a square in a depth map, whose side in pixels is one of `CELLS_PX`. It is the
+smallest side after which the next one increases the covered area by less than the factor
+`CLOSED_GAIN`, because few gaps are left then. Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
-"""A pixel farther than a neighbour by this share is seen through a gap. Chosen by hand."""
+"""A pixel of a depth map whose depth exceeds that of a neighbouring pixel by more than this
+fraction is left out: it is seen through a gap in a nearer surface. Chosen by hand."""
 
 DEPTH_PERCENT = 95.0
-"""Percentage of the sparse points of each view whose depths must fit into the 16 bits of a map."""
+"""The depths of this percentage of the sparse points, in each view, must fit into the 16 bits of a
+depth map."""
 
 MAX_VALUE_PER_UNIT = 1000.0
-"""Depth maps store thousandths, such as millimetres, or coarser steps if 16 bits are too few."""
+"""Depth maps store depths in thousandths of the model's unit, such as millimetres, or in coarser
+steps if 16 bits are too few for that."""
 
 OPENGL = np.diag([1.0, -1, -1, 1])
-"""Transform from camera axes of nerfstudio (y up, z backward) to ours (y down, z forward)."""
+"""Transform from nerfstudio's camera axes (y up, z backward) to those of this package (y down, z
+forward)."""
 
 
 def write_transforms(
@@ -50,14 +54,18 @@ def write_transforms(
     points: Path,
     **more: Any,
 ) -> None:
-    """Write nerfstudio's transforms.json: cameras, `points`, and `files` by JSON key and image."""
+    """Write nerfstudio's transforms.json.
+
+    `files` gives files of each image, by their JSON key (such as "file_path") and by image name.
+    `points` is the file of the point cloud, and `more` are further values at the top level.
+    """
 
     def relative(file: Path) -> str:
-        # The parent of a symbolic link may differ from the one in its path.
+        # Symbolic links are resolved first, because ".." behind one leads to the link's target.
         file = file.resolve()
         try:
             return Path(os.path.relpath(file, path.parent.resolve())).as_posix()
-        except ValueError:  # the file is on another drive of Windows
+        except ValueError:  # on Windows, the file is on another drive
             return file.as_posix()
 
     frames = []
@@ -80,7 +88,8 @@ def write_transforms(
 def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
     """Write splat/: undistorted images/, sparse/0, depths/ (16-bit PNG), and transforms.json.
 
-    Sparse points keep their tracks. Dense points are thinned to `SPLAT_POINTS`, evenly in space.
+    The model in sparse/0 has the sparse points with their tracks, and at most `SPLAT_POINTS` of the
+    dense points, chosen evenly in space.
     """
     target = output / "splat"
     cropped = {own: own.without_border for own in {*found.intrinsics.values()}}
@@ -137,13 +146,16 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
 
 
 def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
-    """Return rows of at most `count` of (N, 3) points: that of least error in each cubic cell."""
+    """Choose at most `count` of the points (N, 3), evenly in space, and return their indices.
+
+    Space is divided into cubic cells. The point with the least error in each cell is chosen.
+    """
     order = np.argsort(errors, kind="stable")
     if len(points) <= count:
         return order
     low, high = 0.0, float(np.ptp(points, axis=0).max())
     best = order[:1]
-    for _ in range(20):  # bisection of the cell size, to a millionth of the extent
+    for _ in range(20):  # bisect the cell size, to a millionth of the extent
         cell = (low + high) / 2
         cells = np.floor((points[order] - points.min(axis=0)) / cell).astype(np.int64)
         keys = cells @ np.array([1, 2_097_152, 2_097_152**2])  # 21 bits for each axis
@@ -156,7 +168,7 @@ def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
 
 
 def seen_depths(view: PosedView, points: np.ndarray) -> np.ndarray:
-    """Return the depth map (H, W) of points (N, 3), NaN where no point is seen."""
+    """Return the depth map (H, W) of points (N, 3) in a view, NaN where no point is seen."""
     width, height = view.camera.size
     xy, depth = view.project(points)
     inside = (depth > 0) & ((xy > -0.5) & (xy < (width - 0.5, height - 0.5))).all(axis=1)

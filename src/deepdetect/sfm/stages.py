@@ -1,7 +1,7 @@
-"""The stages of a reconstruction of many images, and their cached results.
+"""Run the stages of a reconstruction of many images, and cache their results.
 
-Features and matches are in the HDF5 files of `batch`. Models and depth maps are stored with a key
-made of all that they depend on, and a run reuses those with the right key.
+Features and matches are cached in the HDF5 files of `batch`. Models and depth maps are stored under
+a key that is computed from everything they depend on. A later run reuses those with the same key.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
-"""The choice "auto" matches all pairs of up to this number of images. Chosen by hand."""
+"""The choice "auto" matches all pairs of images if there are at most this many. Chosen by hand."""
 
 WORK = "work"
-"""Folder of intermediate results, inside that of the results."""
+"""Name of the folder of intermediate results, inside the output folder."""
 
 LINKS = ".images"
-"""Folder of links to listed images, inside `WORK`. It is hidden, so that a search for images above
-the folder of the results does not find them a second time."""
+"""Name of a folder inside `WORK` with links to the images, if the user gave a list of files. The
+folder is hidden, so that a search for images in a folder above does not find them twice."""
 
 
 @suggest_keywords
@@ -76,21 +76,23 @@ class MultiViewOptions:
         pairs: pairs of images to match: "exhaustive" (all pairs), "sequential:10" (each image with
             the 10 that follow it by name), "similar:20" (with the 20 most similar ones), or "auto"
             (exhaustive for up to 50 images, else similar:20).
-        min_motion: leave out an image if half of its matched keypoints moved, since an earlier one,
-            by less than this share of the longer side, as in most frames of a video. None: use all.
-        matches: "sparse" (only keypoints become points of the model) or "dense" (so do points of
-            the depth maps, and cameras are adjusted to both).
+        min_motion: leave out an image if the median motion of its matched keypoints, relative to an
+            earlier image, is below this fraction of the longer side, as in most frames of a video.
+            None uses all images.
+        matches: "sparse" (the points of the sparse model come from keypoints only) or "dense" (they
+            also come from depth maps, and the cameras are adjusted to all of them).
         mapper: how COLMAP estimates the poses: "incremental" (one image after the other) or
             "global" (all at once, which saves time only for a thousand images or more).
-        dense: make dense points.
+        dense: compute dense points.
         stride_px: try every N-th pixel of every N-th row as a dense point.
-        single_camera: whether images of one size were taken by one camera; by default, those of
-            which EXIF gives the same focal length, or none.
+        single_camera: whether all images of one size share a camera, or each image has its own. By
+            default, images of one size share a camera if EXIF gives them the same focal length, or
+            gives none.
         control_points: file of ground control points in the format of OpenDroneMap's gcp_list.txt;
             they replace the GPS of the images.
-        scale_by: a length in metres and its two ends: two images (the cameras) or two pixels, such
-            as IMG_1.jpg:120,340.
-        formats: further file formats of the model.
+        scale_by: a known length in metres and its two ends. An end is an image, which stands for
+            its camera, or a pixel of an image, such as IMG_1.jpg:120,340.
+        formats: further file formats in which the model is written.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -112,12 +114,13 @@ class MultiViewOptions:
             raise OptionError(f"`scale_by` must be a length above 0 m, not {self.scale_by[0]}")
         if self.pairs != "auto" and not (following(self.pairs) or similar(self.pairs)):
             raise OptionError(
-                f"`pairs` must be auto, exhaustive, sequential:10 or similar:20, not {self.pairs}"
+                "`pairs` must be 'auto', 'exhaustive', or like 'sequential:10' or 'similar:20', "
+                f"not '{self.pairs}'"
             )
         check_name("matches", self.matches, ("sparse", "dense"))
         check_name("mapper", self.mapper, ("incremental", "global"))
         if "mesh" in self.formats and not self.dense:
-            raise OptionError("the format mesh needs dense points: leave out `dense=False`")
+            raise OptionError("the format 'mesh' needs dense points: leave out `dense=False`")
         check_ranges(
             self,
             counts=("stride_px",),
@@ -125,7 +128,7 @@ class MultiViewOptions:
         )
 
     def pair_choice(self, count: int) -> str:
-        """Return how the pairs of `count` images are chosen."""
+        """Return the choice of the pairs of `count` images, with "auto" replaced by its meaning."""
         if self.pairs != "auto":
             return self.pairs
         return "exhaustive" if count <= MAX_EXHAUSTIVE else "similar"
@@ -134,12 +137,12 @@ class MultiViewOptions:
 def check_images(
     images: str | Path | Sequence[str | Path], exclude: Sequence[Path] = ()
 ) -> dict[str, Path]:
-    """Return the paths of the images below a folder or in a list, by their names."""
+    """Return the paths of the images that are below a folder or in a list, by image name."""
     if isinstance(images, (str, Path)):
         folder = Path(images)
         return {path.relative_to(folder).as_posix(): path for path in find_images(folder, exclude)}
     if not np.iterable(images) or not all(map(is_path, images)):
-        raise OptionError("give a folder, or a list of the paths of images")
+        raise OptionError("give a folder, or a list of image files")
     paths = [*map(Path, images)]
     for path in paths:
         if not path.is_file():
@@ -166,13 +169,19 @@ class Stages:
         self.features = self.work / "features.h5"
 
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
-        """Return the images' folder, or one of links for a list, or if results are inside it."""
+        """Return a folder that holds all images, and no results.
+
+        It is the given folder. For a list of files, or if the output folder is inside the given
+        one, it is a folder of links to the images.
+        """
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
-                raise OptionError(f"{images} holds the images: give another folder with -o")
+                raise OptionError(
+                    f"{images} holds the images: give another folder for the results with -o"
+                )
             if not self.output.resolve().is_relative_to(Path(images).resolve()):
                 return Path(images)
-        taken = check_images(images, [self.output])  # images among the results do not count
+        taken = check_images(images, [self.output])  # without images in the output folder
         folder = self.work / LINKS
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -180,7 +189,7 @@ class Stages:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             try:
                 (folder / name).symlink_to(path.resolve())
-            except OSError:  # Windows allows links only to some users
+            except OSError:  # on Windows, only some users may make links
                 shutil.copy2(path, folder / name)
         return folder
 
@@ -192,8 +201,8 @@ class Stages:
     ) -> tuple[dict[str, tuple[int, int]], dict[str, int], dict[str, str]]:
         """Detect and describe the keypoints of all images below a folder.
 
-        Returns, by name, sizes (width, height) and numbers of keypoints of the images that could be
-        read, and a sentence on each of the others.
+        Returns three mappings by image name: the sizes (width, height) and the numbers of keypoints
+        of the images that could be read, and, for each other image, a sentence that says why not.
         """
         report = extract_features(
             folder,
@@ -221,7 +230,7 @@ class Stages:
         return sizes, keypoints, failures
 
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
-        """Choose the pairs of images to match."""
+        """Return the pairs of images to match, chosen as the option `pairs` says."""
         choice = self.options.pair_choice(len(names))
         if not (alike := similar(choice)):
             return list_pairs(choice, names)
@@ -232,8 +241,8 @@ class Stages:
     ) -> tuple[dict[Pair, np.ndarray], dict[str, str]]:
         """Choose and match pairs of images, and leave out images that show nothing new.
 
-        Sizes are (width, height). Returns matches as `match` does, and the images left out, each
-        with the image that shows nearly the same.
+        `sizes` are (width, height) by image name. Returns the matches as `match` does, and the
+        images left out, each with the image that shows nearly the same and is kept.
         """
         names, dropped, limit = [*sizes], dict[str, str](), self.options.min_motion
         while True:
@@ -248,17 +257,18 @@ class Stages:
                 for pair, moved in motions.items()
                 if moved < limit * max(sizes[pair[0]]) and sizes[pair[0]] == sizes[pair[1]]
             }
-            # With similar pairs, an image may have lost all its partners: choose pairs again.
+            # If pairs are chosen by similarity, all partners of an image may have been left out. So
+            # the pairs are chosen again.
             if not (further := thin_out(names, near, dropped)):
                 return matches, dropped
             dropped |= further
             names = [name for name in names if name not in further]
 
     def match(self, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-        """Match pairs of images; return (K, 2) rows of keypoints of each pair.
+        """Match pairs of images; return (K, 2) indices of keypoints for each pair.
 
-        The ratio test replaces the filter by neighbours for keypoints that this filter does not
-        suit: those without sizes, or with other descriptors.
+        Matches are filtered by comparing each with neighbouring matches. The ratio test is used
+        instead if the keypoints lack sizes or angles, or their descriptors do not suit the filter.
         """
         path = self.work / "matches.h5"
         first = first_keypoints(self.features)
@@ -283,11 +293,11 @@ class Stages:
         known: bool,
         refined: bool = True,
     ) -> tuple[Any, dict[Pair, int], list[frozenset[str]]]:
-        """Map the images, or read the model of an earlier run; `known` intrinsics stay fixed.
+        """Estimate poses and sparse points, or read the model of an earlier run.
 
-        If tracks are not `refined`, they stay at the keypoints, and points have no colours. Returns
-        the `pycolmap.Reconstruction`, the number of inliers of each pair, and the names of the
-        images in each other component.
+        If intrinsics are `known`, they stay fixed. If tracks are not `refined`, they stay at the
+        keypoints, and points have no colours. Returns the `pycolmap.Reconstruction`, the number of
+        inliers of each verified pair, and the names of the images in each other component.
         """
         pycolmap, options = import_pycolmap(), self.options
         images = {}
@@ -311,7 +321,8 @@ class Stages:
             verified = {(a, b): count for a, b, count in noted["verified"]}
             components = [frozenset(names) for names in noted["components"]]
             return pycolmap.Reconstruction(sparse), verified, components
-        # SQLite would take a log that a killed run has left for the one of the new database.
+        # A killed run may have left a log of its database. SQLite would take it for the log of the
+        # new database.
         for old in (*self.work.glob("mapping-*.json"), *self.output.glob("database.db-*")):
             old.unlink()
         with atomic_path(database) as path:
@@ -329,7 +340,7 @@ class Stages:
                     verified,
                     known,
                     self.seed,
-                    # A second attempt counts its images again, so the bar must not overflow.
+                    # A second attempt counts images again, so the bar is kept from overflowing.
                     lambda count: bar.update(min(count, len(images) - bar.n)),
                 )
         model = correct_places(model, database, folder, known, self.seed, self.quiet)
@@ -355,11 +366,11 @@ class Stages:
         return model, verified, components
 
     def dense(self, folder: Path, sparse: SparseModel) -> np.ndarray:
-        """Compute the missing depth maps, and fuse all of them to (N,) `DENSE_POINT`."""
+        """Compute the depth maps that are missing, and fuse all maps into (N,) `DENSE_POINT`."""
         return merge_dense_points(self.fused(folder, sparse), self.options.stride_px)
 
     def fused(self, folder: Path, sparse: SparseModel) -> Iterator[tuple[PosedView, np.ndarray]]:
-        """Yield each reference view with its dense points, which may repeat those of others."""
+        """Yield each reference view with its dense points. Other views may repeat its points."""
         store, stride = self.work / "dense", self.options.stride_px
         references = find_references(sparse)
         paths: dict[str, Path] = {}
@@ -415,6 +426,6 @@ def _depth_task(
 def _fuse_task(
     images: list[RegisteredImage], paths: Mapping[str, Path], stride_px: int
 ) -> np.ndarray:
-    images = [image for image in images if image.view.name in paths]  # others have no depth map
+    images = [image for image in images if image.view.name in paths]  # some have no map
     maps = [(load_arrays(paths[image.view.name]) or {})["depth"] for image in images]
     return fuse_depth_maps([limited_view(image.view) for image in images], maps, stride_px)

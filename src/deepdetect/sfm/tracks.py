@@ -1,9 +1,10 @@
-"""Sub-pixel refinement of tracks: a patch of one image is aligned in all other images.
+"""Refine tracks to sub-pixel accuracy: a patch of one image is aligned in all other images.
 
-A keypoint lies at a maximum of its own image, which noise and the viewing angle move. Once the
-cameras are known, a patch of the image that sees a point from the middle is warped to the other
-images and aligned there. Lindenberger et al., "Pixel-Perfect Structure-from-Motion with
-Featuremetric Refinement", 2021, align features of a network instead.
+Keypoints are detected in each image by itself, and noise and the viewing angle move them. Once the
+cameras are known, tracks can be refined. A patch is taken from the image that sees a point from the
+middle of all viewing directions. It is warped to the other images and aligned there. Lindenberger
+et al., "Pixel-Perfect Structure-from-Motion with Featuremetric Refinement", 2021, align features of
+a network instead of grey values.
 """
 
 from __future__ import annotations
@@ -28,40 +29,45 @@ PATCH_RADIUS_PX = 6
 """Radius of the patches that are aligned. Chosen by hand."""
 
 MAX_SHIFT_PX = 2.5
-"""A patch may move by this much from the projection of its point. Chosen by hand."""
+"""Alignment moves a patch at most this far from the projection of its point. Chosen by hand."""
 
 BLUR_SIGMA_PX = 0.7
-"""Sigma of a blur of the images: without it, cubic interpolation dampens noise by an amount that
-depends on the sub-pixel position."""
+"""Images are blurred with this sigma before patches are aligned. Without the blur, cubic
+interpolation dampens noise by an amount that depends on the sub-pixel position."""
 
 MIN_FACING = 0.3
-"""An image is searched for a surface only if the cosine between the line of sight and the normal is
-at least this. Chosen by hand."""
+"""A patch of a surface is searched for in an image only if the cosine of the angle between the
+surface's normal and the direction to the camera exceeds this. Chosen by hand."""
 
 MAX_GROWTH = 7.0
-"""The areas of a patch in two images may differ by at most this factor. Chosen by hand."""
+"""A patch is searched for in another image only if its area there differs from its own area by less
+than this factor. Chosen by hand."""
 
 MIN_COMMON_POINTS = 10
-"""Number of points that two images must share, else no patches are aligned. Chosen by hand."""
+"""Patches of one image are aligned in another only if the two share at least this number of points.
+Chosen by hand."""
 
 DENSE_CELLS = 4500
-"""Number of grid cells of an image, each of which gives at most one dense track. Chosen by hand."""
+"""An image is divided into this number of grid cells, each of which begins at most one dense track.
+Chosen by hand."""
 
 MIN_DISTANCE_PX = 3
-"""Distance of a new track from the earlier tracks of its image. Chosen by hand."""
+"""A new track must begin farther than this from all earlier tracks in its image. Chosen by hand."""
 
 MIN_DENSE_VIEWS = 3
-"""Number of images of a dense track: with two, no other image checks the match."""
+"""A dense track needs at least this number of images: with two, no third one checks the match."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
-"""The cache holds images with the second number of pixels together, at seven bytes each, but at
-least the first number of images. Successive images share neighbours."""
+"""Images are cached, because successive images share neighbours. The cached images have at most
+`CACHED_PIXELS` pixels together, at seven bytes each. But at least `CACHED_IMAGES` are cached,
+whatever their size."""
 
 
 class Surfaces(NamedTuple):
-    """Small planes to be found in other images: (K, 2) whole pixels, (K, 3) points and normals.
+    """Small plane patches around pixels of an image, which are to be found in other images.
 
-    Points and normals are in the frame of the model. Normals are unit vectors towards the image.
+    `pixels` (K, 2) are integers. `points` (K, 3) and `normals` (K, 3) are in the model's frame. The
+    normals are unit vectors that point towards the camera of the image.
     """
 
     pixels: np.ndarray
@@ -70,10 +76,11 @@ class Surfaces(NamedTuple):
 
 
 def refine_tracks(model: Any, folder: Path, quiet: bool = True) -> None:
-    """Replace the tracks of a `pycolmap.Reconstruction` by refined ones; cameras stay fixed.
+    """Replace the tracks of a `pycolmap.Reconstruction` by refined ones. Cameras stay fixed.
 
-    Each point lies at a whole pixel of the image that sees it from the middle, has the colour of
-    that pixel, and is aligned in the other images of its track. `quiet` shows no progress bar.
+    The image that sees a point from the middle of its track gives the point's colour and a patch,
+    both at an integer pixel. The patch is aligned in the other images of the track. With `quiet`,
+    no progress bar is shown.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
@@ -89,10 +96,10 @@ def add_dense_tracks(
 ) -> None:
     """Add tracks of dense points to those of a model.
 
-    `fused` are views, each with the `DENSE_POINT` array of its depth map. An image gives the best
-    corner of each cell of a grid, unless a track of an earlier image is near, which already matches
-    the corner. The model's own tracks, which are shorter, are aligned again where no new track is
-    near.
+    `fused` are views, each with the `DENSE_POINT` array of its depth map. Each image is divided
+    into a grid, and the best corner of each cell begins a track. A corner is left out if a track of
+    an earlier image is near and so matches it already. The model's own tracks are shorter than the
+    new ones. They are aligned again where no new track is near.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
@@ -107,9 +114,10 @@ def add_dense_tracks(
 
 
 def _central_views(sparse: SparseModel) -> dict[str, tuple[Surfaces, np.ndarray]]:
-    """Return, by image, the points that it sees most nearly from the middle, and their rows.
+    """Return, by image, the points that this image sees best from the middle, and their indices.
 
-    The middle of a track is the mean of its lines of sight, which surfaces are assumed to face.
+    The middle is the mean of all lines of sight to a point. The surface at the point is assumed to
+    face this direction.
     """
     images = [*sparse.images.values()]
     rows = np.concatenate([image.points for image in images])
@@ -133,7 +141,7 @@ def _central_views(sparse: SparseModel) -> dict[str, tuple[Surfaces, np.ndarray]
 
 
 class _Tracks:
-    """The tracks that have been found for a model so far."""
+    """The refined tracks of a model that have been found so far."""
 
     def __init__(self, sparse: SparseModel, folder: Path) -> None:
         self.sparse, self.images, self.folder = sparse, [*sparse.images.values()], folder
@@ -142,12 +150,12 @@ class _Tracks:
         self.colors = [np.empty((0, 3), np.uint8)]
         self.count = 0
         none = np.empty(0, np.int64), np.empty((0, 2))
-        self.seen = [[none] for _ in self.images]  # rows of points and pixels, by image
+        self.seen = [[none] for _ in self.images]  # by image: indices of points, pixels
         largest = max(math.prod(image.intrinsics.size) for image in self.images)
         self.read = lru_cache(max(CACHED_IMAGES, int(CACHED_PIXELS / largest)))(self._read)
 
     def corners(self, name: str, points: np.ndarray) -> Surfaces:
-        """Choose the dense points of an image that become tracks: the best corners of a grid."""
+        """Choose dense points of an image to begin tracks: the best corner of each grid cell."""
         image = self.images[self.numbers[name]]
         xy = image.intrinsics.from_pinhole(image.view.project(points["points"])[0])
         pixels = np.rint(xy).astype(np.int64).clip(0, np.array(image.intrinsics.size) - 1)
@@ -157,7 +165,7 @@ class _Tracks:
         return Surfaces(pixels[rows], places, normals)
 
     def free(self, name: str, pixels: np.ndarray) -> np.ndarray:
-        """Return the rows of those of (K, 2) pixels of an image that are not near its tracks."""
+        """From pixels (K, 2) of an image, return the indices of those that are near no track."""
         number = self.numbers[name]
         free = np.ones(self.images[number].intrinsics.size[::-1], np.uint8)
         for _, xy in self.seen[number]:
@@ -169,9 +177,11 @@ class _Tracks:
     def add(
         self, name: str, wanted: Surfaces, tracks: np.ndarray | None = None, min_views: int = 2
     ) -> None:
-        """Align patches of an image in others; patches found in `min_views` images become points.
+        """Align patches of an image in other images, and turn them into points with tracks.
 
-        `tracks` are rows of the model's points, whose images are searched. With None, all are.
+        A patch becomes a point if it is found in at least `min_views` images, including its own.
+        Only images that share `MIN_COMMON_POINTS` with this image are searched. If `tracks` (K,)
+        gives the model's point of each patch, only the images that see this point are searched.
         """
         own = self.numbers[name]
         pixels, points, _ = wanted
@@ -200,7 +210,7 @@ class _Tracks:
     def _aligned(
         self, image: RegisteredImage, other: RegisteredImage, wanted: Surfaces
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows of the patches found in another image, and their pixels there."""
+        """Return the indices of the patches that are found in another image, and their pixels."""
         pixels, points, normals = wanted
         view, seen = image.view, []
         ahead = ((points - view.centre) * normals).sum(axis=1)
@@ -233,7 +243,7 @@ class _Tracks:
 
     def write(self, model: Any) -> None:
         """Replace the tracks of a `pycolmap.Reconstruction` by the tracks found here."""
-        self.read.cache_clear()  # the next adjustment needs the memory
+        self.read.cache_clear()  # frees memory for the next adjustment
         with quiet_pycolmap() as pycolmap:
             numbers = {image.name: number for number, image in model.images.items()}
             model.delete_all_points2D_and_points3D()
@@ -250,6 +260,6 @@ class _Tracks:
                 model.add_point3D(point, track, color)
 
     def _read(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return an image (H, W, 3), and its blurred grey values (H, W) float32."""
+        """Return an image, (H, W, 3) uint8, and its blurred grey values, (H, W) float32."""
         rgb = load_image(self.folder / name, max_megapixels=np.inf)
         return rgb, cv2.GaussianBlur(luma(rgb).astype(np.float32), (0, 0), BLUR_SIGMA_PX)

@@ -1,4 +1,4 @@
-"""Data sets with ground truth, and downloads of data sets (`known/datasets.json`)."""
+"""Read data sets with ground truth, and download the data sets that `known/datasets.json` lists."""
 
 import json
 from functools import cache, partial

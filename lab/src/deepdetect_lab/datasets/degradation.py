@@ -1,7 +1,7 @@
 """Simulate photographs in little light, out of focus, or with motion blur.
 
-To add a degradation, write a function from linear light in [0, 1] and a random generator to an
-8-bit image, and add it to `DEGRADATIONS`.
+To add a degradation, write a function that takes linear light in [0, 1] and a random generator and
+returns an 8-bit image. Then add it to `DEGRADATIONS`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from deepdetect._shared.image_array import srgb_to_linear
 from deepdetect._shared.opencv import cv2
 
 FULL_WELL = 10_000.0
-"""Mean number of electrons for white in full light, per pixel and colour. The electrons follow a
-Poisson distribution, which gives the shot noise. Chosen by hand; not measured."""
+"""A white pixel in full light collects this number of electrons in each colour, on average. Actual
+numbers follow a Poisson distribution, which is the shot noise. Chosen by hand; not measured."""
 
 READ_NOISE = 3.0
-"""Standard deviation of Gaussian read noise, in electrons. Chosen by hand; not measured."""
+"""Standard deviation of the Gaussian read noise, in electrons. Chosen by hand; not measured."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Degradation:
     Attributes:
         name: short name, for example "dark-8".
         title: name in tables.
-        apply: function from (H, W, 3) float32 linear light in [0, 1] and a random generator to
-            uint8 sRGB.
+        apply: function that takes (H, W, 3) float32 linear light in [0, 1] and a random generator,
+            and returns an (H, W, 3) uint8 sRGB image.
         version: number to increase whenever a change of the code changes the result.
     """
 
@@ -43,7 +43,7 @@ class Degradation:
 
 
 def degrade(rgb: np.ndarray, degradation: Degradation) -> np.ndarray:
-    """Return a degraded copy of an image, (H, W, 3) uint8 sRGB, the same in every call."""
+    """Return a degraded copy of an image, (H, W, 3) uint8 sRGB. Equal images give equal copies."""
     own = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:8], "little")
     return degradation.apply(to_linear(rgb), np.random.default_rng([0, own]))
 
@@ -61,7 +61,7 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def darken(linear: np.ndarray, generator: np.random.Generator, fraction: float) -> np.ndarray:
-    """Simulate a photograph taken in a fraction of the light, with the same exposure and gain."""
+    """Simulate a photograph in a fraction of the light, with exposure and gain unchanged."""
     electrons = generator.poisson(linear * (fraction * FULL_WELL)).astype(np.float32)
     electrons += generator.normal(0, READ_NOISE, linear.shape).astype(np.float32)
     return to_srgb(electrons / FULL_WELL)
@@ -73,14 +73,14 @@ def blur_gaussian(linear: np.ndarray, _: np.random.Generator, sigma_px: float) -
 
 
 def blur_motion(linear: np.ndarray, generator: np.random.Generator, length_px: float) -> np.ndarray:
-    """Simulate uniform camera motion of a length in pixels, in a random direction."""
+    """Simulate motion blur: the camera moves uniformly by `length_px` in a random direction."""
     return to_srgb(cv2.filter2D(linear, -1, motion_kernel(length_px, generator.uniform(0, np.pi))))
 
 
 def motion_kernel(length_px: float, angle: float) -> np.ndarray:
-    """Return the kernel, with sum 1, of uniform motion along a line centred at the pixel.
+    """Return the kernel, with sum 1, of uniform motion along a line through its middle pixel.
 
-    The angle of the line is in radians, from x towards y.
+    `angle` is the direction of the line in radians, from the x axis towards the y axis.
     """
     radius = int(np.ceil(length_px / 2))
     kernel = np.zeros((2 * radius + 1, 2 * radius + 1), np.float64)

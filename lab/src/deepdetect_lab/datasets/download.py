@@ -1,7 +1,7 @@
-"""Download data sets with resuming and checksums, unpack them, and check them.
+"""Download data sets, unpack them, and check them. Broken downloads can be resumed.
 
-It uses `requests` and not pooch, because pooch does not resume a broken download, which the 19 GB
-of COCO need.
+This module uses `requests` instead of pooch, because pooch cannot resume a broken download. With
+the 19 GB of COCO, resuming is needed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CHUNK_BYTES = 1 << 16
 """Downloads are written in blocks of this size, so that an interruption loses at most one block."""
 
 TIMEOUT_SECONDS = 60.0
-"""A host is given up if it sends nothing for this time. Chosen by hand; not measured."""
+"""A host is given up if it sends no bytes for this time. Chosen by hand; not measured."""
 
 ARCHIVE_SUFFIXES = (".zip", ".tar.gz", ".tgz", ".tar")
 
@@ -36,7 +36,8 @@ WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
     *(errno.EMFILE, errno.ENFILE),
 )
-"""Errors of the disk or the system. All other errors while unpacking mean a bad archive."""
+"""Error numbers that mean a problem of the disk or the system. While an archive is unpacked, all
+other errors mean that the archive is damaged."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,11 @@ class RemoteFile:
     Attributes:
         urls: addresses in the order in which they are tried: the official host, then mirrors.
         size: approximate size in bytes.
-        checksum: "md5:..." or "sha256:...". With None the data set's contents are checked instead.
-        into: folder of the data set to unpack an archive into, or path of a single file.
-        inside: folder of the archive whose contents are used.
+        checksum: "md5:..." or "sha256:...". If it is None, only the contents of the finished data
+            set are checked.
+        into: where the file belongs in the data set: for an archive, the folder to unpack it into;
+            for any other file, its path.
+        inside: folder inside the archive, if any, whose contents are moved up into `into`.
         suffixes: endings of the files to unpack from a tar archive; empty for all files.
     """
 
@@ -75,8 +78,8 @@ class RemoteDataset:
         files: archives to unpack, and single files.
         images: number of images.
         licence: the terms of use.
-        contents: `content_digest` of files by their path in the data set. It does not depend on
-            the archive or the image format.
+        contents: digests of files (see `content_digest`), by path of the file in the data set. The
+            digests do not depend on the archive or the image format.
         texts: contents of text files to write, by path in the data set.
         prepare: function that converts the unpacked files in a folder to the data set. Its second
             argument says whether progress bars are off.
@@ -100,8 +103,8 @@ class RemoteDataset:
 def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = True) -> Path:
     """Download and unpack a data set, unless the folder already holds it.
 
-    An interrupted download is resumed. The folder appears when all images are complete and correct.
-    Then the archives are removed.
+    An interrupted download is resumed. The folder appears only when all images are complete and
+    correct. Then the archives are removed.
 
     Args:
         dataset: the data set.
@@ -125,14 +128,14 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
         paths = [store / f"{k:02d}-{file.name}" for k, file in enumerate(dataset.files)]
         every = zip(dataset.files, paths, strict=True)
         missing = [(file, path) for file, path in every if not path.exists()]
-        # Archives and unpacked files together need about twice the size.
+        # The archives and the unpacked files together need about twice the size of the download.
         done = sum(file_state(_part(path))[0] for _, path in missing)
         needed = dataset.size + sum(file.size for file, _ in missing) - done
         free = shutil.disk_usage(store).free
         if free < needed:
             raise DeepDetectError(
-                f"{final.parent} has {free / 1e9:.1f} GB free, {needed / 1e9:.1f} GB are needed: "
-                "make room or choose another folder"
+                f"{final.parent} has {free / 1e9:.1f} GB free, but {needed / 1e9:.1f} GB are "
+                "needed: make room or choose another folder"
             )
         for file, path in missing:
             download(file, path, quiet=quiet)
@@ -150,23 +153,24 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
 
 
 def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
-    """Download a file, which appears when it is complete and its checksum is correct.
+    """Download a file to `path`, where it appears only when it is complete and correct.
 
-    Until then the bytes are in `path` with ".part" added, so the next call can resume. If all hosts
-    fail, the error of the last host is raised.
+    Until then its bytes are in a file with ".part" added to the name, so that the next call can
+    resume. If all hosts fail, the error of the last host is raised.
     """
     from requests import RequestException
 
     part = _part(path)
     for k, url in enumerate(file.urls):
         if k and file.checksum is None:
-            part.unlink(missing_ok=True)  # another host may send other bytes
+            part.unlink(missing_ok=True)  # bytes of another host may differ
         try:
             _fetch(url, file, part, quiet)
             if file.checksum is not None and not has_checksum(part, file.checksum):
                 part.unlink()
                 raise DeepDetectError(
-                    f"{url} does not have the checksum {file.checksum}: try again later"
+                    f"the file from {url} does not have the checksum {file.checksum}: try again "
+                    "later"
                 )
             part.replace(path)
             return
@@ -181,18 +185,18 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
 
 
 def has_checksum(path: Path, checksum: str) -> bool:
-    """Whether a file has a checksum such as "sha256:..." or "md5:..."."""
+    """Whether the checksum of a file is the given one, such as "sha256:..." or "md5:..."."""
     algorithm, _, digest = checksum.partition(":")
     with path.open("rb") as file:
         return hashlib.file_digest(file, algorithm).hexdigest() == digest
 
 
 def content_digest(folder: Path, name: str) -> str | None:
-    """Return the SHA-256 of a file's content in any format; None if there is no such file.
+    """Return the SHA-256 of a file's content, or None if there is no such file.
 
-    The name of an image has no suffix. The digest of an image covers pixels, shape and type, so a
-    lossless copy in another format has the same digest. The digest of a text file ignores white
-    space.
+    `name` is the path in the folder; for an image, it is given without suffix. The digest of an
+    image covers its pixels, shape and data type, so a lossless copy in another format has the same
+    digest. The digest of a text file does not depend on the kind and amount of white space.
     """
     path = folder / name
     if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
@@ -218,13 +222,13 @@ def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
     have = file_state(part)[0]
     headers = {"Range": f"bytes={have}-"} if have else {}
     with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_SECONDS) as response:
-        if response.status_code == 416:  # the file is complete; the checksum confirms it
+        if response.status_code == 416:  # the file is complete; `download` checks it
             if file.checksum is None:
                 part.unlink()
                 raise requests.ConnectionError("the partial file belongs to another file")
             return
         response.raise_for_status()
-        if response.status_code != 206:  # the server sends the whole file again
+        if response.status_code != 206:  # the server cannot resume and sends the whole file
             have = 0
         length = response.headers.get("Content-Length")
         total = have + int(length) if length else max(file.size, have)
@@ -249,14 +253,15 @@ def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
     for name, digest in dataset.contents.items():
         found = content_digest(folder, name)
         if found != digest:
-            state = "is missing" if found is None else "is not the one of the data set"
+            state = "is missing" if found is None else "has other contents"
             raise DeepDetectError(
-                f"{subject} holds another {dataset.name}, whose {name} {state}: get it again"
+                f"{subject} holds another version of {dataset.name}, whose {name} {state}: "
+                "get it again"
             )
 
 
 def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet: bool) -> None:
-    """Unpack into a temporary folder, and rename it when it is complete and correct."""
+    """Unpack the files into a temporary folder, and rename it to `final` if all is correct."""
     unfinished = final.with_name(f".{final.name}.part")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
@@ -297,7 +302,7 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
                 endings = file.suffixes or ("",)
                 members = [m for m in tar if not m.isdir() and m.name.lower().endswith(endings)]
                 _extract(members, lambda one: _extract_file(tar, one, target), quiet)
-    except Exception as error:  # zip, tar and their compressions raise many types
+    except Exception as error:  # zip, tar and their compressions raise errors of many types
         if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
             raise
         raise DeepDetectError(
@@ -310,13 +315,13 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
 
 
 def _extract_file(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
-    """Extract a file of a tar archive into a folder, as a copy if it is a link.
+    """Extract a file of a tar archive into a folder. A link becomes a copy of its target.
 
-    Python's own filter for safe extraction exists only since 3.11.4.
+    Python's own filter for safe extraction is not used, because it exists only since 3.11.4.
     """
     path, content = target / member.name, tar.extractfile(member)
     if content is None or not path.resolve().is_relative_to(target.resolve()):
-        raise tarfile.TarError(f"{member.name!r} is outside the folder or not a file")
+        raise tarfile.TarError(f"{member.name!r} would lie outside the folder, or is not a file")
     path.parent.mkdir(parents=True, exist_ok=True)
     with content, path.open("wb") as file:
         shutil.copyfileobj(content, file)

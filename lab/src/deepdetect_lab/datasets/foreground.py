@@ -1,6 +1,7 @@
-"""Photographs with a mask of their foreground, for example ECSSD (Yan et al., 2013).
+"""List photographs that have a mask of their foreground, for example ECSSD (Yan et al., 2013).
 
-A folder holds pairs NAME.jpg (or .png) and NAME_mask.png. Masks are white on the foreground.
+For each photograph NAME.jpg or NAME.png, the folder holds a mask NAME_mask.png. Masks are white on
+the foreground.
 """
 
 from __future__ import annotations

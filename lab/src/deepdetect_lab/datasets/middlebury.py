@@ -1,4 +1,4 @@
-"""Rectified stereo with ground truth: Middlebury 2003 to 2014 (Scharstein and Szeliski).
+"""Load rectified stereo pairs with ground truth: Middlebury 2003 to 2014 (Scharstein and Szeliski).
 
 A scene is a folder with left.png, right.png, disparity.png (of the left view) and calib.json, which
 says how grey values are converted to disparities in pixels::
@@ -50,7 +50,7 @@ class CalibratedStereoPair(StereoPair):
 
 
 def load_middlebury(folder: str | Path) -> StereoPair:
-    """Load a scene with its ground truth, upscaled to the size of the images if it is smaller."""
+    """Load a scene and its true disparity map, which is upscaled if the images are larger."""
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
@@ -61,21 +61,24 @@ def load_middlebury(folder: str | Path) -> StereoPair:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check the path") from None
     except (ValueError, OverflowError, RecursionError, KeyError, TypeError) as error:
         raise ImageError(
-            f"{path} does not say how a ground truth is stored ({error}): take a scene that has one"
+            f"{path} does not say how the ground truth is stored ({error}): take a scene that has "
+            "ground truth"
         ) from None
     with open_image(file) as image:
         stored, is_gray = np.asarray(image), image.mode == "L" or image.mode.startswith("I")
     if not is_gray or not value > 0:
-        raise ImageError(f"the ground truth {file} is not a grey image with a scale above 0")
+        raise ImageError(
+            f"the ground truth {file} must be a grey image with a value_per_pixel above 0"
+        )
     disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
-    # A map may be smaller than the images; it is upscaled by nearest neighbours.
+    # If the map is smaller than the images, it is upscaled by nearest neighbours.
     size = (left.shape[1], left.shape[0])
     disparity = np.asarray(Image.fromarray(disparity).resize(size, Image.Resampling.NEAREST))
     return StereoPair(root.name, left, right, disparity)
 
 
 def load_calibrated_pair(folder: str | Path) -> CalibratedStereoPair:
-    """Load a scene with its calib.json but without ground truth; the disparity is NaN."""
+    """Load the images and calib.json of a scene, but no ground truth: the disparity is NaN."""
     root, left, right = _load_views(folder)
     size = (left.shape[1], left.shape[0])
     calibration = Calibration.load(root / "calib.json", size)
@@ -86,7 +89,7 @@ def load_calibrated_pair(folder: str | Path) -> CalibratedStereoPair:
 def load_motorcycle() -> StereoPair:
     """Load the Motorcycle pair of Middlebury 2014 (741x500) and the true disparity.
 
-    It is part of the scikit-image wheel, so nothing is downloaded.
+    The pair is part of the scikit-image wheel, so nothing is downloaded.
     """
     left, right, disparity = data.stereo_motorcycle()
     disparity = np.asarray(disparity, np.float32).squeeze()

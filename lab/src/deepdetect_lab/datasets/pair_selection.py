@@ -11,13 +11,13 @@ Item = TypeVar("Item")
 
 
 FRAME_DISTANCES = (1, 3, 5, 10, 15, 20)
-"""Images of a pair from a sequence are this number of frames apart. Chosen by hand; not
-measured."""
+"""The two images of a pair from a sequence are one of these numbers of frames apart. Chosen by
+hand; not measured."""
 
 
 def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
-    """Choose all pairs of unordered images, or `max_pairs` evenly spaced ones if there are more."""
-    # Not all pairs are listed, because ten thousand images have fifty million pairs.
+    """Choose all pairs of `count` unordered images, or at most `max_pairs` evenly spaced ones."""
+    # The full list of pairs is not made, because ten thousand images have fifty million pairs.
     ends = np.cumsum(np.arange(count - 1, 0, -1))
     ranks = np.array(evenly_spaced(range(count * (count - 1) // 2), max_pairs), int)
     first = np.searchsorted(ends, ranks, side="right")
@@ -28,7 +28,7 @@ def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
 def sequence_pairs(
     frames: Sequence[int], max_pairs: int, distances: Sequence[int]
 ) -> list[tuple[int, int]]:
-    """Choose evenly spaced pairs of frame numbers, equally many at each distance in frames."""
+    """Choose evenly spaced pairs of frame numbers, equally many at each of the `distances`."""
     existing = set(frames)
     starts_per_distance = max(1, max_pairs // len(distances))
     pairs = [
@@ -42,7 +42,7 @@ def sequence_pairs(
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """Return evenly spaced items of a sequence, including the first and the last."""
+    """Return at most `count` evenly spaced items of a sequence, with the first and the last."""
     if len(items) <= count:
         return list(items)
     return [items[row] for row in np.linspace(0, len(items) - 1, count).round().astype(int)]

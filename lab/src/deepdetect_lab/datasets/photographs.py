@@ -1,7 +1,7 @@
-"""Training photographs: crops of photographs in public repositories, each with its licence.
+"""Cut the training images from photographs in public repositories, each with its licence.
 
-`benchmarks/list_photographs.py` of commit 81b8253 made the list `known/photographs.csv.gz`. It has
-no near-duplicates and no images of the data sets used for evaluation.
+The list of crops is `known/photographs.csv.gz`. `benchmarks/list_photographs.py` of commit 81b8253
+made it. The list has no near-duplicates, and no images of the data sets used for evaluation.
 """
 
 from __future__ import annotations
@@ -38,10 +38,12 @@ noise."""
 VALIDATION_SHARE = 1 / 20
 
 FREE_LICENCES = ("CC0", "CC BY", "CC BY-SA", "Unsplash")
-"""Prefixes of licences that allow any use, including use of weights trained on the images."""
+"""Names of licences that allow any use, including that of weights trained on the images, begin with
+these."""
 
 RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECASE)
-"""Restrictions in the names of licences that begin like a free licence."""
+"""Words for restrictions (non-commercial, no derivatives) in names of licences. Such a licence is
+not free even if its name begins like that of a free one."""
 
 LICENCES_FILE = "licences.csv"
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
@@ -50,9 +52,9 @@ SOURCES_FOLDER = "sources"
 
 @dataclass(frozen=True)
 class Source:
-    """A GitHub repository "OWNER/NAME" at a commit, as source of crops.
+    """A commit of the GitHub repository "OWNER/NAME", from whose photographs crops are cut.
 
-    `megabytes` is the size of its archive. The names of its crops begin with `name`.
+    `megabytes` is the size of the commit's archive. The file names of the crops begin with `name`.
     """
 
     name: str
@@ -75,7 +77,7 @@ class Source:
 
 @cache
 def listed_sources() -> dict[str, Source]:
-    """Return the repositories of the listed crops, by name."""
+    """Return the repositories from which the listed crops are cut, by name of the source."""
     text = resources.files(__package__).joinpath("known/sources.json").read_text("utf-8")
     names = ("name", "repository", "commit", "megabytes")
     return {row["name"]: Source(*(row[name] for name in names)) for row in json.loads(text)}
@@ -83,9 +85,10 @@ def listed_sources() -> dict[str, Source]:
 
 @dataclass(frozen=True)
 class Crop:
-    """A square crop of a photograph of a `Source`, with its licence and the SHA-256 of its file.
+    """A square crop of a photograph from a `Source`.
 
-    The photograph is scaled to a shorter side of `short_side_px`; (x, y) is the upper left corner.
+    `path`, `sha256` and `licence` are those of the photograph. It is scaled so that its shorter
+    side is `short_side_px`. In the scaled photograph, (x, y) is the upper left corner of the crop.
     """
 
     source: str
@@ -98,18 +101,18 @@ class Crop:
 
     @property
     def is_free(self) -> bool:
-        """Whether the licence allows any use, like CC BY, and unlike CC BY-NC and CC BY-ND."""
+        """Whether the licence allows any use, as CC BY does, but not CC BY-NC or CC BY-ND."""
         return self.licence.startswith(FREE_LICENCES) and not RESTRICTED.search(self.licence)
 
     @property
     def part(self) -> str:
-        """Part of the data set, "train" or "val", the same for all crops of a photograph."""
+        """Part of the data set: "train" or "val". All crops of a photograph are in one part."""
         return "val" if int(self.sha256[:8], 16) < VALIDATION_SHARE * 2**32 else "train"
 
 
 @cache
 def listed_crops() -> tuple[Crop, ...]:
-    """Return all crops. The crops of one photograph follow each other."""
+    """Return all listed crops. Crops of the same photograph follow each other in the list."""
     file = resources.files(__package__).joinpath("known/photographs.csv.gz")
     text = gzip.decompress(file.read_bytes()).decode()
     return tuple(
@@ -119,9 +122,10 @@ def listed_crops() -> tuple[Crop, ...]:
 
 
 def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
-    """Replace the repositories in `sources` by crops in `train` and `val`, and licences.csv.
+    """Write crops to the folders train and val, and their licences to licences.csv.
 
-    Crops of the same photograph must follow each other.
+    The photographs are read from repositories in the folder sources, which is then removed. Crops
+    of the same photograph must follow each other in `crops`.
     """
     rows = [("file", "picture", "licence", "sha256")]
     with progress(len(crops), "cropping", "crop", quiet) as bar:
@@ -139,7 +143,7 @@ def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
 
 
 def _cut(sources: Path, crops: Sequence[Crop]) -> Iterator[tuple[Crop, Image.Image]]:
-    """Yield each crop with its image. A photograph is read once for all of its crops."""
+    """Yield each crop with its image. Each photograph is read only once for all of its crops."""
     for listed, of_picture in groupby(crops, attrgetter("source", "path", "sha256")):
         source, path, sha256 = listed
         try:
@@ -156,10 +160,10 @@ def _cut(sources: Path, crops: Sequence[Crop]) -> Iterator[tuple[Crop, Image.Ima
 
 
 def cut(picture: Image.Image, short_side_px: int, x: int, y: int) -> Image.Image:
-    """Scale a photograph and crop a square of `CROP_SIDE_PX`."""
+    """Scale a photograph to the shorter side `short_side_px`, and crop a square at (x, y)."""
     scale = short_side_px / min(picture.size)
     size = [max(short_side_px, round(side * scale)) for side in picture.size]
-    # Only the crop is scaled, because some photographs have 100 megapixels.
+    # The scaling is done for the crop only, because some photographs have 100 megapixels.
     box = np.array([x, y, x + CROP_SIDE_PX, y + CROP_SIDE_PX]) * (
         np.array(picture.size * 2) / np.array(size * 2)
     )

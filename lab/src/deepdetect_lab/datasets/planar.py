@@ -1,4 +1,4 @@
-"""Planar scenes with true homographies: Oxford, HPatches, and the paper's low-visibility pairs."""
+"""List planar scenes with true homographies: Oxford, HPatches, the paper's low-visibility pairs."""
 
 from __future__ import annotations
 
@@ -34,15 +34,17 @@ NOT_IN_D2NET_SUBSET = {
     *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
     *("v_artisans", "v_astronautis", "v_talent"),
 }
-"""HPatches scenes above 1600x1200 pixels. Most papers leave them out, for example D2-Net's."""
+"""HPatches scenes with images larger than 1600x1200 pixels. Most papers, for example D2-Net's,
+leave these scenes out."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarPair:
-    """Two images of a plane, or from one viewpoint. The first is image number 1 of its scene.
+    """Two images that a homography relates: they show a plane, or come from one viewpoint.
 
-    The (3, 3) homography maps columns (x, y, 1) of the first image to the second. The centre of the
-    first pixel is (0, 0). `kind` is the change between the images, "" if unknown.
+    The first is image 1 of its scene, the second image `number`. `homography` (3, 3) maps column
+    vectors (x, y, 1) of the first image to the second. The centre of the first pixel is (0, 0).
+    `kind` says what changes between the images, such as "viewpoint", or is "" if unknown.
     """
 
     scene: str
@@ -54,13 +56,13 @@ class PlanarPair:
 
     @property
     def name(self) -> str:
-        """Name as in papers, for example "graf 1-6"."""
+        """Name of the pair as in papers, for example "graf 1-6"."""
         return f"{self.scene} 1-{self.number}"
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarScene:
-    """A scene and the pairs of its first image with each other image."""
+    """A scene. Each of its pairs consists of the first image and one of the other images."""
 
     name: str
     pairs: tuple[PlanarPair, ...]
@@ -71,7 +73,7 @@ class PlanarScene:
         return [self.pairs[0].first, *(pair.second for pair in self.pairs)]
 
     def with_max_pairs(self, max_pairs: int) -> PlanarScene:
-        """Return the scene with at most `max_pairs` evenly spaced pairs. 1 takes the last pair."""
+        """Return the scene with at most `max_pairs` evenly spaced pairs. If 1, it is the last."""
         kept = self.pairs[-1:] if max_pairs == 1 else evenly_spaced(self.pairs, max_pairs)
         return replace(self, pairs=tuple(kept))
 
@@ -81,7 +83,8 @@ def load_oxford(
 ) -> list[PlanarScene]:
     """List the Oxford scenes in a folder, at most eight (Mikolajczyk et al., 2005).
 
-    "published" homographies are read from H1toKp, "refined" ones from H1toKp.refined if it exists.
+    The homography to image K is read from the file H1toKp. With the `truth` "refined", it is read
+    from H1toKp.refined if that file exists.
     """
     scenes = []
     for name, kind in OXFORD_KINDS.items():
@@ -121,8 +124,11 @@ def load_hpatches(folder: str | Path) -> list[PlanarScene]:
 
 
 def load_low_visibility(folder: str | Path) -> list[PlanarScene]:
-    """List the paper's dusty and smoky scenes: SCENE/img1, SCENE/img2 (.png or .bmp), H1to2p."""
-    layout = "the folder must hold dusty and smoky"
+    """List the paper's two low-visibility scenes, in the folders dusty and smoky.
+
+    Each of these folders holds img1 and img2 (.png or .bmp) and the homography H1to2p.
+    """
+    layout = "the folder must hold the folders dusty and smoky"
     return [
         _load_scene(Path(folder) / name, "img", ("H1to2p",), (".png", ".bmp"), layout)
         for name in ("dusty", "smoky")
@@ -137,9 +143,10 @@ def _load_scene(
     layout: str,
     kind: str = "",
 ) -> PlanarScene:
-    """Load images PREFIX1, PREFIX2, ... and the homographies from the first to each other image.
+    """List images PREFIX1, PREFIX2, ... and read homographies from the first to each other image.
 
-    Suffixes are tried in the given order. `layout` is a text that says what the folder must hold.
+    For each image, the suffixes are tried in the given order. `layout` is the part of error
+    messages that says what the folder must hold.
     """
     files = []
     for number in range(1, len(homographies) + 2):

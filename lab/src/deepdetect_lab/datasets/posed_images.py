@@ -1,13 +1,13 @@
-"""Read folders of images with known cameras, in three public layouts, or with GPS positions.
+"""Read folders of images whose cameras are known (three public layouts) or which have GPS.
 
 - Strecha et al. (2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
 - KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt or K.txt, and with
-  poses.txt. The first line of calib.txt is the projection matrix of the camera. K.txt is its
-  camera matrix. Line N of poses.txt belongs to image N.
+  poses.txt. The first line of calib.txt holds the projection matrix of the camera. K.txt holds its
+  camera matrix. Line 1 of poses.txt belongs to image 000000.
 - COLMAP (Schönberger and Frahm, 2016): a text or binary model without distortion in the folder, in
   sparse/ or in sparse/0/, and images in the folder or in images/. pycolmap reads the model.
 
-Intrinsics refer to the image files. If a camera is given for another image size, they are scaled.
+Intrinsics are in pixels of the image files. They are scaled if they are given for another size.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 MAX_ROTATION_ERROR = 1e-3
-"""Rotation matrices may deviate from orthonormal ones by this value, since files have few
-digits."""
+"""The product of a rotation matrix and its transpose may differ from the identity by this value,
+since files have few digits."""
 
 MAX_ASPECT_ERROR = 0.01
-"""The aspect ratios of image and camera may differ by this fraction, since sizes are rounded."""
+"""The aspect ratio of an image may differ from that of its camera by this fraction, since sizes are
+rounded to pixels."""
 
 COLMAP_FILES = ("images.bin", "images.txt")
 
@@ -58,7 +59,11 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class PosedPair:
-    """Two images of a scene. `frame_distance` is None for unordered images."""
+    """Two images of a scene.
+
+    `frame_distance` is the number of frames from the first to the second image of a sequence. It is
+    None for unordered images.
+    """
 
     scene: str
     first: PosedImage
@@ -82,7 +87,7 @@ class PosedPair:
 
     @property
     def fundamental(self) -> np.ndarray:
-        """The (3, 3) fundamental matrix F in pixels, with x1^T F x0 = 0."""
+        """The (3, 3) fundamental matrix F: x1^T F x0 = 0 for pixels x0 (first) and x1 (second)."""
         essential = cross_matrix(self.translation) @ self.rotation
         inverses = [np.linalg.inv(image.intrinsics) for image in (self.first, self.second)]
         return inverses[1].T @ essential @ inverses[0]
@@ -90,7 +95,7 @@ class PosedPair:
 
 @dataclass(frozen=True, eq=False)
 class PosedScene:
-    """A scene.
+    """The images of a scene, their cameras, and the pairs chosen for matching.
 
     Attributes:
         name: name of the folder.
@@ -113,9 +118,9 @@ def load_posed_scenes(
 
     Args:
         folder: a scene in one of the three layouts, or a folder of scenes.
-        max_pairs: largest number of pairs of a scene. Pairs of unordered images are evenly spaced.
-            A sequence has equally many pairs at each of `FRAME_DISTANCES`.
-        located: also read folders whose first image has a GPS position.
+        max_pairs: at most this number of pairs are chosen in a scene. Pairs of unordered images are
+            evenly spaced. A sequence has equally many pairs at each of `FRAME_DISTANCES`.
+        located: also read folders without cameras whose first image has a GPS position.
 
     Raises:
         ImageError: there is no scene, or a file is missing or damaged.
@@ -171,8 +176,8 @@ def _load_scene(
 def _read_strecha(folder: Path) -> list[PosedImage]:
     """Read the .camera files of a folder.
 
-    A file holds K, a row of zeros, the axes and the centre of the camera in the world, and the
-    image size.
+    A file holds the camera matrix, a row of zeros, the camera's axes (columns of a matrix) and
+    centre in the world, and the width and height of the image.
     """
     images = []
     for file in sorted(folder.glob("*.camera")):
@@ -211,22 +216,22 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
         frame = int(path.stem)
         if frame >= len(lines):
             raise ImageError(
-                f"{poses} has {len(lines)} lines, but no pose of {path.name}: line 1 is of 000000"
+                f"{poses} has {len(lines)} lines and no pose for {path.name}: line 1 is for 000000"
             )
         where = f"line {frame + 1} of {poses}"
         pose = _numbers(lines[frame].split(), 12, where).reshape(3, 4)
         axes, centre = pose[:, :3], pose[:, 3]
         image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
-        _image_size(path)  # raises errors for damaged images and for EXIF rotations
-        # The poses are those of KITTI's first camera. The last column of the projection matrix
-        # gives the offset of the images' camera from it.
+        _image_size(path)  # raises an error if the image is damaged or has an EXIF rotation
+        # The poses are those of KITTI's first camera, but another one may have taken the images.
+        # The last column of the projection matrix gives the offset between the two.
         offset = np.linalg.solve(image.intrinsics, projection[:, 3])
         images.append(replace(image, translation=image.translation + offset))
     return images
 
 
 def _colmap_model(folder: Path) -> Path | None:
-    """Return the folder of a COLMAP model, or None."""
+    """Return the folder that holds a COLMAP model, or None if there is no model."""
     places = [folder, folder / "sparse", folder / "sparse" / "0"]
     return next((p for p in places if any((p / name).is_file() for name in COLMAP_FILES)), None)
 
@@ -235,7 +240,11 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
     place = _colmap_model(folder) or folder
     try:
         model = import_pycolmap("COLMAP's model").Reconstruction(place)
-    except (ValueError, IndexError, RuntimeError) as error:  # the type depends on the damage
+    except (
+        ValueError,
+        IndexError,
+        RuntimeError,
+    ) as error:  # the type of error depends on the damage
         raise ImageError(
             f"{place} has no model that pycolmap can read ({first_line(error)}): write cameras, "
             "images and points3D with COLMAP"
@@ -245,15 +254,15 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
         paths = [path for part in ("", "images") if (path := folder / part / image.name).is_file()]
         if not paths:
             raise ImageError(
-                f"there is no image {image.name} in {folder} or its images: put it there"
+                f"there is no image {image.name} in {folder} or its folder images: put it there"
             )
         camera, pose = image.camera, image.cam_from_world()
         if camera.model_name not in ("SIMPLE_PINHOLE", "PINHOLE"):
             raise ImageError(
-                f"a camera in {place} is of the model {camera.model_name}, not PINHOLE: undistort "
+                f"a camera in {place} has the model {camera.model_name}, not PINHOLE: undistort "
                 "the images first (colmap image_undistorter)"
             )
-        # COLMAP's first pixel has its centre at (0.5, 0.5).
+        # In COLMAP, the centre of the first pixel is (0.5, 0.5).
         matrix = camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         matrix = _scaled(matrix, (camera.width, camera.height), paths[0], place)
         rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
@@ -285,12 +294,12 @@ def _posed_image(
     """Check the camera of an image, and return the image with its camera."""
     wrong = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if wrong > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
-        raise ImageError(f"{where} is not a rotation: its columns must be orthonormal")
+        raise ImageError(f"{where} has no valid rotation matrix: its columns must be orthonormal")
     lower = [intrinsics[1, 0], intrinsics[2, 0], intrinsics[2, 1], intrinsics[2, 2] - 1]
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or np.any(lower):
         raise ImageError(
-            f"the camera of {path.name} has no camera matrix with focal lengths above 0 and a last "
-            f"row 0 0 1: correct the file that {where} belongs to"
+            f"the camera matrix of {path.name} must have zeros below its diagonal, focal lengths "
+            f"above 0 and the last row 0 0 1: correct the camera that belongs to {where}"
         )
     return PosedImage(path, intrinsics, rotation, translation)
 
@@ -298,12 +307,15 @@ def _posed_image(
 def _scaled(
     intrinsics: np.ndarray, size: tuple[float, float], image: Path, file: Path
 ) -> np.ndarray:
-    """Scale intrinsics from a size (width, height) to the image's; image borders coincide."""
+    """Scale intrinsics from a size (width, height) to that of an image file.
+
+    The borders of the two sizes are aligned, not the centres of their first pixels.
+    """
     own = _image_size(image)
     if min(size) <= 0 or abs(own[0] * size[1] / (own[1] * size[0]) - 1) > MAX_ASPECT_ERROR:
         raise ImageError(
             f"{image} is {own[0]}x{own[1]} pixels, but {file} is for {size[0]:g}x{size[1]:g}: take "
-            "images of the same shape"
+            "images of the same aspect ratio"
         )
     x, y = (mine / its for mine, its in zip(own, size, strict=True))
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]]) @ intrinsics

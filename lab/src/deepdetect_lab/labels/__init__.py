@@ -1,4 +1,4 @@
-"""Labels for training: fusion of classical detectors into one binary mask."""
+"""Make labels for training: fuse the detections of classical detectors into one binary mask."""
 
 from .detectors import DETECTOR_NAMES, DETECTORS, LabelDetector
 from .fusion import Label, draw_label, fuse, visibility_of

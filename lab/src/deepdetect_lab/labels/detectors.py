@@ -1,7 +1,8 @@
 """The nine label detectors: a function for each, and a table of all.
 
-To add a detector, write a function from an (H, W) uint8 grey image and settings to an (H, W) bool
-mask. Add it to `DETECTORS` with its settings: the paper's values for normal images, and ranges.
+To add a detector, write a function that takes an (H, W) uint8 grey image and settings and returns
+an (H, W) bool mask. Add it to `DETECTORS`. For each setting, give the value for normal images (the
+paper's, if it has one) and the allowed range.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from deepdetect._shared.opencv import cv2, opencv_factory
 Value = bool | int | float
 Settings = Mapping[str, Any]
 Range = tuple[float, float] | range
-"""The smallest and the largest allowed value as a tuple, or all allowed integers as a range."""
+"""The allowed values of a setting: a tuple of the smallest and the largest one, or a range of all
+allowed integers."""
 
 AGAST_OAST_9_16 = 3
 """The value of `AgastFeatureDetector::OAST_9_16`, which some OpenCV versions do not export."""
@@ -31,8 +33,8 @@ GRAY_LEVELS = (0, 255)
 BLOCK_SIZES = (1, 255)
 KERNEL_SIZES = range(1, 32, 2)
 CANNY_THRESHOLDS = (0, 2040)
-"""Canny's thresholds apply to the sum of the absolute gradients in x and y of the 3x3 Sobel filter,
-which lies in this range in grey levels."""
+"""Allowed range of Canny's two thresholds. They apply to the sum of the absolute x and y gradients
+of the 3x3 Sobel filter, which lies in this range for 8-bit images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +43,11 @@ class LabelDetector:
 
     Attributes:
         kind: whether it marks keypoints or edges (the two masks of the paper's Figure 4).
-        function: function from an (H, W) uint8 grey image and all settings to an (H, W) bool mask.
-        settings: value of each setting for normal images, and the allowed range of numeric ones.
-        low_visibility: settings that differ for images with few grey levels.
+        function: function that takes an (H, W) uint8 grey image and all settings, and returns an
+            (H, W) bool mask.
+        settings: for each setting, its value for normal images and its allowed range, None if it is
+            not numeric.
+        low_visibility: the settings whose values differ for images of low visibility.
     """
 
     kind: Literal["keypoint", "edge"]
@@ -62,9 +66,9 @@ class LabelDetector:
 
 
 def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:
-    """Return a mask, bool, of the pixels nearest to the points (N, 2) that are inside the image.
+    """Return a bool mask that marks, for each of the points (N, 2), the nearest pixel.
 
-    Halves are rounded to even.
+    `shape` is that of the image. Points outside the image are ignored. Halves are rounded to even.
     """
     mask = np.zeros(shape[:2], dtype=bool)
     column, row = np.rint(np.asarray(xy, dtype=np.float64).reshape(-1, 2)).astype(np.intp).T
@@ -80,7 +84,7 @@ def _marked(gray: np.ndarray, detector: cv2.Feature2D) -> np.ndarray:
 def _sift(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect extrema of the difference-of-Gaussians scale space (Lowe, 2004).
 
-    The default settings practically switch off the edge test.
+    The default `edge_threshold` is so high that practically no extremum on an edge is rejected.
     """
     detector = cv2.SIFT_create(
         nOctaveLayers=settings["octave_layers"],
@@ -93,7 +97,7 @@ def _sift(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect FAST corners on an image pyramid, by default all of them (Rublee et al., 2011)."""
-    # OpenCV fails on pyramid levels smaller than a pixel.
+    # The number of levels is limited, because OpenCV fails on levels smaller than a pixel.
     most = 1 + int(math.log(min(gray.shape)) / math.log(settings["scale_factor"]))
     detector = cv2.ORB_create(
         nfeatures=settings["features"],
@@ -107,16 +111,17 @@ def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _brisk_detector(threshold: int, octaves: int) -> cv2.Feature2D:
-    """Make a BRISK detector.
+    """Make a BRISK detector, or return the one made for earlier images.
 
-    It is cached, because computing its pattern takes as long as detection in a dark image.
+    In a dark image, computing its sampling pattern would take as long as detection.
     """
     return opencv_factory("BRISK_create")(thresh=threshold, octaves=octaves)
 
 
 def _brisk(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect AGAST corners in a scale space (Leutenegger et al., 2011)."""
-    # OpenCV fails on layers smaller than a pixel. Each octave has a layer of 2/3 of its size.
+    # The number of octaves is limited, because OpenCV fails on layers smaller than a pixel. The
+    # smaller layer of an octave has 2/3 of the octave's size.
     most = (2 * min(gray.shape) // 3).bit_length()
     return _marked(gray, _brisk_detector(settings["threshold"], min(settings["octaves"], most)))
 
@@ -131,7 +136,8 @@ def _fast(gray: np.ndarray, settings: Settings) -> np.ndarray:
 def _agast(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect corners by the segment test with an adaptive decision tree (Mair et al., 2010).
 
-    With equal settings the mask equals FAST's, since only the order of comparisons differs.
+    With equal settings, the mask equals that of FAST, because only the order of comparisons
+    differs.
     """
     create = opencv_factory("AgastFeatureDetector_create")
     return _marked(gray, create(settings["threshold"], settings["suppression"], AGAST_OAST_9_16))
@@ -140,8 +146,8 @@ def _agast(gray: np.ndarray, settings: Settings) -> np.ndarray:
 def _harris(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect corners by the gradient covariance matrix (Harris and Stephens, 1988).
 
-    The response is dilated by 3x3, which creates blobs. Then a threshold relative to the largest
-    response is applied.
+    The response is dilated by 3x3, so a corner becomes a blob. Then all pixels are marked whose
+    response exceeds a fraction of the largest one.
     """
     response = cv2.cornerHarris(gray, settings["block_size"], settings["aperture"], settings["k"])
     if settings["dilate"]:
@@ -170,7 +176,7 @@ def _canny(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 
 def _sobel(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """Detect thick edges: gradients of a wide filter above a fraction of the largest one."""
+    """Detect thick edges: mark wide Sobel gradients above a fraction of the largest gradient."""
     dx = cv2.Sobel(gray, cv2.CV_64F, 1, 0, ksize=settings["kernel_size"])
     dy = cv2.Sobel(gray, cv2.CV_64F, 0, 1, ksize=settings["kernel_size"])
     magnitude = cv2.magnitude(dx, dy)
@@ -250,7 +256,7 @@ DETECTOR_NAMES: tuple[str, ...] = tuple(DETECTORS)
 
 
 def select_detectors(names: Iterable[str]) -> tuple[str, ...]:
-    """Check detector names and sort them in the order of the table."""
+    """Check detector names, and return them in the order of `DETECTORS`."""
     wanted = set(names)
     for name in sorted(wanted - DETECTORS.keys()):
         raise unknown_name("label detector", name, DETECTOR_NAMES)

@@ -1,7 +1,7 @@
 """Keypoint-edge fusion: the pixelwise OR of the label detectors (paper, Section III-A).
 
-It labels images in memory, and image files. The masks of image files are written as 1-bit PNG
-files.
+`fuse` labels an image in memory. `label_file` labels an image file, and writes the mask as a 1-bit
+PNG file.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
 
 LOW_VISIBILITY_RANGE = 64
-"""An image has low visibility if its luma spans fewer grey levels than this (measurements:
-`visibility_of`)."""
+"""An image has low visibility if its luma spans fewer grey levels than this. The docstring of
+`visibility_of` gives measurements."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Label:
-    """A fusion label.
+    """A label that keypoint-edge fusion gives an image.
 
     Attributes:
-        keypoints: (H, W) bool, pixels marked by a keypoint detector.
-        edges: (H, W) bool, pixels marked by an edge detector.
-        visibility: visibility of the image, "normal" or "low", which selects the settings.
+        keypoints: (H, W) bool, pixels marked by at least one keypoint detector.
+        edges: (H, W) bool, pixels marked by at least one edge detector.
+        visibility: "normal" or "low", by which the settings of the detectors were chosen.
     """
 
     keypoints: np.ndarray
@@ -46,7 +46,7 @@ class Label:
 
     @cached_property
     def mask(self) -> np.ndarray:
-        """(H, W) bool, the pixelwise OR of both masks."""
+        """(H, W) bool, the pixelwise OR of `keypoints` and `edges`."""
         return self.keypoints | self.edges
 
     def __repr__(self) -> str:
@@ -116,10 +116,10 @@ def fuse(
 
 
 def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
-    """Draw the paper's Figure 4: image, keypoint mask, edge mask, and their combination.
+    """Draw a picture like the paper's Figure 4: image, keypoint mask, edge mask, combined mask.
 
     Returns:
-        Four panels in a row. The captions of the masks give their density.
+        The four panels in a row. The caption of a mask gives the percentage of marked pixels.
     """
     panels = [add_caption(rgb, f"image ({label.visibility} visibility settings)")]
     masks = {"keypoints": label.keypoints, "edges": label.edges, "combined": label.mask}
@@ -131,7 +131,10 @@ def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LabelTask:
-    """An image file to label and its mask file. `figure` is a file for the paper's Figure 4."""
+    """An image file to label. The mask is written to the file `mask`.
+
+    If `figure` is given, a picture like the paper's Figure 4 is written to this file.
+    """
 
     image: Path
     mask: Path
@@ -141,13 +144,13 @@ class LabelTask:
 
     @property
     def outputs(self) -> Outputs:
-        """The output files, and the records of their inputs."""
+        """The output files, with a record of the image and options that they are made from."""
         paths = [self.mask] if self.figure is None else [self.mask, self.figure]
         return Outputs(paths, [self.image], {"label": self.options}, self.overwrite)
 
 
 def label_file(task: LabelTask) -> dict[str, Any] | str:
-    """Write the mask of an image file; return the values for its record, or an error text."""
+    """Write the mask of an image file. Return values for its record, or the text of an error."""
     try:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)

@@ -1,4 +1,4 @@
-"""Settings of labels: detectors and their parameters, by name, from a TOML file, or one by one."""
+"""Choose the detectors of labels and their settings: by name, in a TOML file, or one by one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
 Visibility = Literal["normal", "low"]
 
 Settings = Mapping[str, Mapping[str, Mapping[str, Value]]]
-"""Changed settings by detector, section ("normal" or "low_visibility") and parameter."""
+"""Settings that differ from the defaults: their values by detector, then by section ("normal" or
+"low_visibility"), then by name of the setting."""
 
 SECTIONS: dict[Visibility, str] = {"normal": "normal", "low": "low_visibility"}
 
@@ -24,13 +25,15 @@ SECTIONS: dict[Visibility, str] = {"normal": "normal", "low": "low_visibility"}
 @suggest_keywords
 @dataclass(frozen=True)
 class LabelOptions:
-    """Detectors and settings of a label.
+    """The detectors that make a label, and their settings.
 
     Attributes:
         detectors: names of the detectors to fuse (default: all nine).
-        visibility: settings for "normal" or "low" visibility. "auto" chooses "low" if the luma
-            spans fewer than 64 grey levels from the 1st to the 99th percentile.
-        settings: settings that differ from the paper's, for normal and for low visibility.
+        visibility: which settings to use, those for "normal" or for "low" visibility. "auto" uses
+            those for "low" if the image's luma spans fewer than 64 grey levels from the 1st to the
+            99th percentile.
+        settings: settings that differ from the paper's, by detector and then by section, which is
+            "normal" or "low_visibility".
 
     Raises:
         OptionError: a name is unknown (the message gives the nearest known name), or a value has
@@ -58,16 +61,17 @@ class LabelOptions:
         object.__setattr__(self, "settings", checked)
         if idle := sorted(checked.keys() - set(self.detectors)):
             raise OptionError(
-                f"{idle[0]} has settings but is not among the detectors: add it, or remove them"
+                f"{idle[0]} has settings but is not among the detectors: add it to them, or remove "
+                "its settings"
             )
 
     def with_detectors(self, names: tuple[str, ...]) -> LabelOptions:
-        """Return the options with other detectors; settings of omitted detectors are removed."""
+        """Return options with other detectors. Settings of detectors not in `names` are dropped."""
         kept = {name: self.settings[name] for name in self.settings if name in names}
         return replace(self, detectors=names, settings=kept)
 
     def parameters(self, detector: str, visibility: Visibility) -> dict[str, Value]:
-        """Return all parameters of a detector for a visibility."""
+        """Return the values of all settings of a detector, for an image of this visibility."""
         entry = DETECTORS[detector]
         low = entry.low_visibility if visibility == "low" else {}
         changed = self.settings.get(detector, {}).get(SECTIONS[visibility], {})
@@ -109,7 +113,8 @@ def _checked_value(detector: str, name: str, value: Any) -> Value:
 
 LABEL_SETTINGS: dict[str, LabelOptions] = {
     "paper": LabelOptions(),
-    # Denser labels suit geometry. They were chosen by correct stereo matches (docs/training.md).
+    # Denser labels suit geometric tasks. The number of correct stereo matches decided on this value
+    # (docs/training.md).
     "dense": LabelOptions(settings={"sobel": {"normal": {"relative_threshold": 0.02}}}),
 }
 
@@ -129,7 +134,7 @@ def find_label_settings(settings: str | Path) -> LabelOptions:
         settings: a name of `LABEL_SETTINGS`, or the path of a file.
 
     Raises:
-        OptionError: the name is unknown, or the file is unreadable or has a wrong entry.
+        OptionError: the name is unknown, or the file cannot be read or has a wrong entry.
 
     Example:
         >>> find_label_settings("dense").settings

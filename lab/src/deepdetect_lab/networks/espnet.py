@@ -1,7 +1,7 @@
 """ESPNet: the efficient spatial pyramid network (Mehta et al., ECCV 2018), in torch.
 
-The paper trains it to predict the fusion mask (Section III-B). Module names are those of the
-published state dict, so that its weights can be loaded.
+DeepDetect's paper trains ESPNet to predict the fusion mask (Section III-B). Modules have the names
+that they have in the published state dict, so that its weights can be loaded.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.
 
 
 def _norm_activation(channels: int, **before: nn.Module) -> nn.Sequential:
-    """Return the given modules followed by batch normalisation and PReLU (a slope per channel)."""
+    """Chain the modules `before`, a batch normalisation, and a PReLU with a slope per channel."""
     norm = nn.BatchNorm2d(channels, eps=EPSILON)
     return nn.Sequential(OrderedDict(before, bn=norm, act=nn.PReLU(channels)))
 
 
 class DilatedConvolution(nn.Module):
-    """A dilated 3x3 convolution, which uses float32 on the CPU even under autocast.
+    """A dilated 3x3 convolution, which computes in float32 on the CPU even under autocast.
 
-    On the CPU in bfloat16 with channels_last, PyTorch 2.13 returns NaN or wrong gradients. A
-    training step with our own implementation of the gradients was 7 % faster.
+    On the CPU, in bfloat16 and with channels_last, PyTorch 2.13 returns NaN or wrong gradients for
+    dilated convolutions. With our own code for the gradients, in place of float32, a training step
+    was only 7 % faster.
     """
 
     def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
@@ -44,9 +45,10 @@ class DilatedConvolution(nn.Module):
 
 
 class SpatialPyramid(nn.Module):
-    """A reducing convolution, then five dilated branches, summed cumulatively and concatenated.
+    """A convolution that reduces the channels, then five dilated branches, which are concatenated.
 
-    The reducing convolution has kernel size 1, or kernel size 3 and stride 2 to halve the size.
+    The reducing convolution has kernel size 1, or kernel size 3 and stride 2, which halves the
+    height and width of the features.
     """
 
     d1: DilatedConvolution
@@ -63,7 +65,11 @@ class SpatialPyramid(nn.Module):
             setattr(self, f"d{dilation}", DilatedConvolution(narrow, width, dilation))
 
     def branches(self, x: Tensor) -> Tensor:
-        """Return the concatenated branches. Each is summed with those of smaller dilations."""
+        """Return the concatenated branches, partly summed.
+
+        From dilation 4 on, a branch is replaced by the sum of the branches from dilation 2 up to
+        itself.
+        """
         reduced = self.c1(x)
         parts = [self.d1(reduced)]
         running = self.d2(reduced)
@@ -75,7 +81,7 @@ class SpatialPyramid(nn.Module):
 
 
 class DownsamplingPyramid(SpatialPyramid):
-    """A spatial pyramid that halves the size."""
+    """A spatial pyramid that halves the height and width of the features."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(inputs, outputs, reduce=3)
@@ -87,7 +93,7 @@ class DownsamplingPyramid(SpatialPyramid):
 
 
 class ResidualPyramid(SpatialPyramid):
-    """A spatial pyramid that keeps the size, with or without a residual connection."""
+    """A spatial pyramid that keeps height and width, with or without a residual connection."""
 
     def __init__(self, inputs: int, outputs: int, residual: bool = True) -> None:
         super().__init__(inputs, outputs, reduce=1)
@@ -100,7 +106,7 @@ class ResidualPyramid(SpatialPyramid):
 
 
 class Encoder(nn.Module):
-    """ESPNet's encoder, with features at 1/2, 1/4 and 1/8 of the image size."""
+    """ESPNet's encoder. It returns features at 1/2, 1/4 and 1/8 of the image size."""
 
     def __init__(self, decoder_channels: int, p: int, q: int) -> None:
         super().__init__()
@@ -131,9 +137,10 @@ class Encoder(nn.Module):
 
 
 class ESPNet(nn.Module):
-    """ESPNet predicts a logit per pixel of an image whose sides are multiples of 8.
+    """ESPNet predicts a logit for each pixel of an image whose sides are multiples of 8.
 
-    It has `p` pyramids at 1/4 of the size and `q` at 1/8; the default has 408,039 parameters.
+    It has `p` residual pyramids at 1/4 of the image size and `q` at 1/8. With the default `p` and
+    `q`, it has 408,039 parameters.
     """
 
     def __init__(self, p: int = 5, q: int = 9, decoder_channels: int = 10) -> None:

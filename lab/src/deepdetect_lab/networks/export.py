@@ -30,10 +30,11 @@ from deepdetect.detector.onnx_files.graph import (
 from deepdetect.detector.pretrained import LOGITS, PADDED_IMAGE, STRIDE
 
 OPSET = 17
-"""Version of the ONNX operator set, which ONNX Runtime 1.24, OpenVINO and OpenCV 4 can read."""
+"""Version of the ONNX operator set. ONNX Runtime 1.24, OpenVINO and OpenCV 4 can all read it."""
 
 _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
-"""Shape of a factor per output channel that scales a kernel, by type of convolution."""
+"""Batch normalisation is folded into a kernel by one factor per output channel. This is the shape
+in which the factors multiply the kernel, by type of convolution."""
 
 
 def to_onnx(
@@ -43,7 +44,10 @@ def to_onnx(
     axes: Mapping[str, Mapping[int, str]],
     training: Any = torch.onnx.TrainingMode.EVAL,
 ) -> onnx.ModelProto:
-    """Trace a network with named inputs to ONNX. `axes` names dynamic axes of inputs and output."""
+    """Convert a network to ONNX by tracing it with example `inputs`, which are given by name.
+
+    `axes` names the axes of variable size, by input or output and by number of the axis.
+    """
     written = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # warnings of the tracer
@@ -63,11 +67,11 @@ def to_onnx(
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
-    """Write a network that predicts heat maps for any image size, atomically."""
+    """Write a network that predicts heat maps, atomically, to an ONNX file for any image size."""
     # The name "network" becomes part of all node names, on which `tiling` relies.
     module = nn.Sequential(OrderedDict(network=network))
     axes = {0: "batch", 2: "height", 3: "width"}
-    # Batch normalisations stay separate nodes, because `add_padding` folds them in float64.
+    # Batch normalisations stay separate nodes here, because `add_padding` folds them in float64.
     model = to_onnx(
         module,
         {"image": torch.zeros(2, 3, 64, 96)},
@@ -82,8 +86,9 @@ def export_onnx(network: nn.Module, path: str | Path) -> None:
 def add_padding(model: ModelProto) -> None:
     """Extend a network from `image` to `logits`: accept any size, and also output probabilities.
 
-    The image's last row and column are repeated up to multiples of 8, and the maps are cropped, as
-    in `compute_maps`. Probabilities are at most 1. Batch normalisation is folded.
+    As in `compute_maps`, the last row and column of the image are repeated until its sides are
+    multiples of 8, and the maps are cropped to the size of the image. Probabilities are clipped to
+    at most 1. Batch normalisation is folded into the convolutions.
     """
     graph = model.graph
     fold_normalisation(graph)
@@ -109,10 +114,11 @@ def add_padding(model: ModelProto) -> None:
 
 
 def fold_normalisation(graph: GraphProto) -> None:
-    """Fold batch normalisation into the preceding convolution, or into a factor and an offset.
+    """Fold each batch normalisation into the convolution before it.
 
-    It is computed in float64, so that the same weights give the same numbers everywhere: PyTorch's
-    exporter rounds differently on different processors. Convolutions must not have a bias yet.
+    If there is no convolution before it, it becomes a factor and an offset. The folding is computed
+    in float64, so that the same weights give the same numbers everywhere: PyTorch's exporter rounds
+    differently on different processors. The convolutions must not have a bias yet.
     """
     values = {one.name: one for one in graph.initializer}
     made = {name: node for node in graph.node for name in node.output}
@@ -138,7 +144,7 @@ def fold_normalisation(graph: GraphProto) -> None:
             kernel = numpy_helper.to_array(values[name]) * factor.reshape(shape)
             arrays = {f"{name}.folded": kernel, f"{name}.bias": offset}
             before.input[:] = [before.input[0], *arrays]
-            for other in graph.node:  # `tiling` uses the names of PyTorch's exporter
+            for other in graph.node:  # `tiling` relies on the names of PyTorch's exporter
                 rename(other, target, source)
         else:
             both = {f"{target}.factor": factor, f"{target}.offset": offset}
@@ -153,8 +159,8 @@ def fold_normalisation(graph: GraphProto) -> None:
 def give_four_dimensions(graph: GraphProto) -> None:
     """Store numbers per channel as (1, C, 1, 1) instead of the equivalent (C, 1, 1).
 
-    For three dimensions OpenVINO transposes the image before and after each sum, product or PReLU
-    with such a constant, which took a third of the time.
+    With three dimensions, OpenVINO transposes the features before and after each sum, product or
+    PReLU with such a constant. These transpositions took a third of the time.
     """
     used = {
         name

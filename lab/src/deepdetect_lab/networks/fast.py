@@ -1,10 +1,10 @@
-"""The fast network: plain convolutions of the luma, and a global term of the whole image.
+"""The fast network: plain convolutions of the luma, and a global term from the whole image.
 
-Labels are computed from the luma by detectors with small windows, so a few plain convolutions
-suffice. Runtimes compute these faster than dilated branches and sums. But the detectors' thresholds
-are relative to the strongest response of the image and to its range of grey levels. So a global
-term (histogram of the luma, means and maxima of the features) scales the luma at the start and
-gives thresholds for the features before upsampling.
+Detectors with small windows compute the labels from the luma, so a few plain convolutions suffice.
+Runtimes compute these faster than the dilated branches and sums of ESPNet. But some thresholds of
+the detectors depend on the strongest response in the image, and the settings on its range of grey
+levels. So a global term is computed from the histogram of the luma and from means and maxima of the
+features. It scales the luma at the start, and gives thresholds for the features before upsampling.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ HALF, QUARTER, EIGHTH = 16, 32, 40
 because the layers there take most time."""
 
 RED, GREEN, BLUE = 9798, 19235, 3735
-"""Weights of the luma (BT.601) in units of 1/32,768, as in OpenCV."""
+"""Weights of red, green and blue in the luma (BT.601), in units of 1/32,768, as in OpenCV."""
 
 BINS = 24
-"""Number of bins of the luma's histogram. A value is split between the two nearest bins. Chosen by
-hand; not measured."""
+"""Number of bins of the luma's histogram. Each value is divided between the two nearest bins.
+Chosen by hand; not measured."""
 
 HISTOGRAM_STEP_PX = 8
-"""The histogram samples every 8th pixel in both directions to save time."""
+"""The histogram is made of every 8th pixel in both directions, to save time."""
 
 GAIN_RANGE = (-1, 5)
-"""Range of the logarithm of the gain on the luma. It is this large because dark images may span
-only 1/100 of the grey levels."""
+"""Range of the natural logarithm of the gain that multiplies the luma. It is this large because
+dark images may span only 1/100 of the grey levels."""
 
 
 class Luma(nn.Module):
     """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W), OpenCV's 8-bit luma divided by 255.
 
-    Labels are computed from this luma, and in dark images a single grey level matters. All values
-    are integers below 2^24, which float32 holds exactly. It is no convolution, because GPUs would
-    round one (TF32).
+    Labels are computed from the same luma, and in dark images a single grey level matters. All
+    intermediate values are integers below 2^24, which float32 holds exactly. The weighted sum is
+    not written as a convolution, because GPUs would round that (TF32).
     """
 
     def forward(self, image: Tensor) -> Tensor:
@@ -53,10 +53,10 @@ class Luma(nn.Module):
 
 
 class Exposure(nn.Module):
-    """Map luma (B, 1, H, W) to features (B, BINS + 2, 1, 1), and to its mean (B, 1, 1, 1).
+    """Map luma (B, 1, H, W) to features (B, BINS + 2, 1, 1) and to the mean luma (B, 1, 1, 1).
 
-    The features are the logarithms of the histogram's bins, the mean, and the logarithm of the
-    variance.
+    The features are the logarithms of the bins of the luma's histogram, the mean luma, and the
+    logarithm of its variance.
     """
 
     def forward(self, luma: Tensor) -> tuple[Tensor, Tensor]:
@@ -70,7 +70,7 @@ class Exposure(nn.Module):
 
 
 class Perceptron(nn.Sequential):
-    """Two linear layers with ReLU in between, for (B, C, 1, 1) features."""
+    """Two linear layers with a ReLU in between, which map features of shape (B, C, 1, 1)."""
 
     def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
@@ -83,7 +83,7 @@ class Perceptron(nn.Sequential):
 
 
 class Convolution(nn.Module):
-    """A convolution with batch normalisation and ReLU. A stride of 2 halves the size."""
+    """A convolution with batch normalisation and ReLU. A stride of 2 halves height and width."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ class Convolution(nn.Module):
 
 
 class FastNetwork(nn.Module):
-    """The fast network predicts a logit per pixel of an image whose sides are multiples of 8.
+    """The fast network predicts a logit for each pixel of an image whose sides are multiples of 8.
 
     It has 57,613 parameters and needs 632 million multiply-adds at 640x480.
 
@@ -125,11 +125,12 @@ class FastNetwork(nn.Module):
         self.logits = nn.Conv2d(HALF, 4, 1)
         nn.init.constant_(
             self.get_parameter("logits.bias"), -1.0
-        )  # the logit of about the fraction of marked pixels
+        )  # about the logit of the fraction of pixels that a label marks
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""
-        # Autocast would round the luma, but the smallest thresholds are a single grey level.
+        # Autocast would round the luma. But a difference of one grey level matters, because it is
+        # the smallest threshold of the label detectors.
         with torch.autocast(image.device.type, enabled=False):
             luma = self.luma(image)
             exposure, mean = self.exposure(luma)

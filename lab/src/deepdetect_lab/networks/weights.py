@@ -1,4 +1,4 @@
-"""Networks by name, and their weights in safetensors files: state dicts with notes."""
+"""Find networks by name, and read and write their weights as safetensors files with notes."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from .espnet import ESPNet
 from .fast import FastNetwork
 
 NETWORKS: dict[str, type[nn.Module]] = {"espnet": ESPNet, "fast": FastNetwork}
-"""Networks by name. They need no arguments and map (B, 3, H, W) float32 RGB in [0, 1] to
-(B, 1, H, W) logits.
+"""Classes of networks by name. A network is made without arguments, and maps (B, 3, H, W) float32
+RGB in [0, 1] to (B, 1, H, W) logits.
 
-Sides are multiples of `STRIDE`. To add a network, write a module in this package and add it here.
+H and W are multiples of `STRIDE`. To add a network, write a module in this package and add it here.
 """
 
 
@@ -32,14 +32,14 @@ weights in ONNX files."""
 
 
 def find_weights(weights: str | Path) -> Path:
-    """Return the path of a safetensors file, given as a path or by a name of `PRETRAINED`."""
+    """Return the path of a weights file, from its path or from a name in `PRETRAINED`."""
     if names_a_file(weights):
         return Path(weights)
     return FOLDER / f"{look_up('name or file of weights', str(weights), PRETRAINED)}.safetensors"
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[str, str]) -> None:
-    """Write tensors atomically, with notes in the file's header."""
+    """Write tensors to a safetensors file, atomically, with `notes` in its header."""
     stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with atomic_path(path) as temporary:
         try:
@@ -49,10 +49,10 @@ def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[st
 
 
 def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
-    """Make a network from a weights file, in evaluation mode.
+    """Load a network from a weights file, in evaluation mode.
 
-    The network's class is the one of `kinds` (default: `NETWORKS`) that shares most tensor names
-    with the file.
+    The class of the network is the one of `kinds` (default: all of `NETWORKS`) that has most tensor
+    names in common with the file.
     """
     if not Path(path).is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
@@ -74,16 +74,17 @@ def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
 
 
 def average_weights(paths: Sequence[str | Path]) -> nn.Module:
-    """Make a network, as `load_network` does, from the mean of several weights files.
+    """Load a network, as `load_network` does, with the mean of the weights in several files.
 
-    The mean of successive runs is often better than each of them (Wortsman et al., "Model soups",
-    2022). Integer counts are taken from the first file.
+    The mean of the weights of several training runs is often better than those of each run
+    (Wortsman et al., "Model soups", 2022). Integers, the counters of batch normalisation, are taken
+    from the first file.
     """
     networks = [load_network(path) for path in paths]
     for path, network in zip(paths, networks, strict=True):
         if type(network) is not type(networks[0]):
             raise WeightsError(
-                f"{path} is of another network than {paths[0]}: give weights of one network"
+                f"{path} has weights of another network than {paths[0]}: give files of one network"
             )
     states = [network.state_dict() for network in networks]
     mean = {
@@ -106,7 +107,7 @@ def read_notes(path: str | Path) -> dict[str, str]:
 
 
 def weights_digest(network: nn.Module) -> str:
-    """Return the SHA-256 of a network's state, which does not depend on the file format."""
+    """Return the SHA-256 of a network's state dict. It does not depend on any file format."""
     digest = hashlib.sha256()
     for name, value in sorted(network.state_dict().items()):
         digest.update(name.encode())
