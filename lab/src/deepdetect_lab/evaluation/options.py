@@ -56,7 +56,7 @@ class BenchmarkOptions:
         max_images: largest number of images per scene in structure from motion. If a scene has
             more, the first images of a sequence or evenly spaced other images are taken.
         ranker: npz file written by `deepdetect dev train-points`, with the network that ranks
-            multi-scale keypoints. None: the file in this package.
+            multi-scale keypoints. None: the bundled file.
 
     Raises:
         OptionError: a name is unknown, or a number is out of its range.
@@ -85,7 +85,7 @@ class BenchmarkOptions:
             )
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
-        """Return DeepDetect as in the paper: images resized to 480x480, SIFT descriptors of 3 px."""
+        """Return DeepDetect as in the paper: images resized to 480x480, SIFT of size 3 px."""
         return deepdetect_feature(
             self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)),
             SelectionOptions(threshold),

@@ -168,7 +168,7 @@ class Run:
         return rows
 
     def cached(self, stage: str, depends: object, make: Callable[[], Row]) -> Row:
-        """Read a result of one of `STAGES` from the cache; if it is not there, compute and cache it.
+        """Read a result of one of `STAGES` from the cache, or else compute and cache it.
 
         A result maps names to arrays, numbers or texts. `depends` holds all inputs of the result,
         which identify it in the cache. A path among them stands for the content of its file.
@@ -246,7 +246,7 @@ class Run:
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
     ) -> tuple[list[np.ndarray], float]:
-        """Return the descriptors of the keypoints of both images, and the seconds for computing them.
+        """Return the descriptors of both images' keypoints, and the seconds for computing them.
 
         The descriptors of the last pair stay in memory, to be matched again with other settings.
         """
