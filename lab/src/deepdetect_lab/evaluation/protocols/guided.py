@@ -51,7 +51,7 @@ NOTE = (
     "the first image counts once. Matchable: points of the first image that the true homography "
     "maps to within this distance of a point of the second image. Guided: guided matching runs "
     f"with {SEEDS} seeds, and the columns show the run with the median number of correct matches. "
-    "±: standard deviation of this number over the seeds. Of the matchable: number of correct "
+    '±: standard deviation of this number over the seeds. "Of the matchable": number of correct '
     "matches divided by that of matchable points; lowest: the smallest such fraction of a seed. "
     "Unique: correct matches, where each point of the second image counts once. A seed that finds "
     "no trusted geometry has no matches, as in match_images. Corner error: median over the seeds "

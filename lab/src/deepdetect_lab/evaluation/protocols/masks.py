@@ -22,8 +22,8 @@ EPSILON = 1e-7
 which is infinite at 0. For comparison, float32 numbers just below 1 differ by 6e-8."""
 
 NUM_BINS = 20
-"""For the calibration error, probabilities are divided into this number of equally wide bins. Chosen
-by hand; not measured."""
+"""The calibration error sorts probabilities into this number of equally wide bins. Chosen by hand;
+not measured."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def mean_score(measured: Sequence[Measured]) -> MaskScore:
 
 
 CERTAIN_LOGIT = 200.0
-"""In float32 the probability of this logit is exactly 1, and that of the negative logit is 0."""
+"""The probability of this logit is exactly 1 in float32, and that of the negative logit is 0."""
 
 
 def sample_images(folder: str | Path) -> list[Path]:

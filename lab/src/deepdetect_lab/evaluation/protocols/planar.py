@@ -53,7 +53,7 @@ TRUTHS = {
     ),
 }
 
-NOTHING_MOVES = "Between the two images of a scene nothing moves: the true homography is the identity."
+NOTHING_MOVES = "Nothing moves between the images of a scene: the true homography is the identity."
 
 
 def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
@@ -150,7 +150,7 @@ def _figures(
 def _drawn(
     run: Run, what: str, draw: Callable[[Any], Figure], items: Sequence[PlanarPair | PlanarScene]
 ) -> list[Figure]:
-    """Draw a figure of each item. If an item cannot be drawn, record the reason and leave it out."""
+    """Draw a figure of each item. If one cannot be drawn, record the reason and leave it out."""
     figures = [run.attempt(f"{what} of {item.name}", draw, item) for item in items]
     return [figure for figure in figures if figure is not None]
 

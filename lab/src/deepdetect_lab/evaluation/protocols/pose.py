@@ -48,14 +48,14 @@ MIN_MATCHES = 6
 
 NO_FAR_POINTS = 1e9
 """An essential matrix allows four poses. OpenCV chooses the one with most points in front of both
-cameras, but leaves out points farther away than this number of baselines. With this value all
-points count, which would otherwise be limited to 50 baselines."""
+cameras, but leaves out points farther away than this number of baselines. The value is so large
+that all points count."""
 
 BUDGET = 8192
 RATIO = 0.8
 GOOD_DEG = 5.0
-"""When a method is compared with SIFT pair by pair, a pose counts as correct if its error in degrees
-is below this."""
+"""When a method is compared with SIFT pair by pair, a pose counts as correct if its error is below
+this number of degrees."""
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
@@ -65,11 +65,11 @@ AGREEING = f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px"
 TEXT = (
     "The relative pose of two cameras is estimated from matches in the same way for all methods: "
     f"OpenCV's MAGSAC with a threshold of {THRESHOLD_PX:g} px and a confidence of {CONFIDENCE:g} "
-    "estimates the essential matrix with the true intrinsics. Of its four possible poses, the one "
+    "estimates the essential matrix with the true intrinsics. It allows four poses, and the one "
     "with most points in front of both cameras is used. The error of a pose is the larger of two "
     "angles, the rotation error and the translation error. Methods differ in the matches. "
     '"DeepDetect": `match_images` with its defaults, which is guided matching. "DeepDetect, '
-    'unguided": the same keypoints are matched by descriptors alone (patchmatch, mutual nearest '
+    'unguided": keypoints are matched by descriptors alone (patchmatch, mutual nearest '
     f"neighbours). All others: the best {BUDGET:,} keypoints are matched by exact mutual nearest "
     f"neighbours with ratio {RATIO:g}, or without ratio test if descriptors are learned.",
     f'"{STRAIGHT_AHEAD}" uses no image. It assumes no rotation, and the second camera in front of '
