@@ -98,7 +98,7 @@ class BenchmarkOptions:
         return self.detector.configured(HeatmapOptions("native", self.channels))
 
     def deepdetect_native(self) -> LocalFeature:
-        """Return DeepDetect at native image resolution, with all pixels over 0.5 as keypoints."""
+        """Return DeepDetect at native resolution, with all pixels of probability over 0.5."""
         title = "DeepDetect, native resolution, all pixels over 0.5"
         return deepdetect_feature(self.native_detector(), name="deepdetect-native", title=title)
 
@@ -113,20 +113,13 @@ class BenchmarkOptions:
         return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
 
     def matching_features(self) -> list[LocalFeature]:
-        """Return the features to compare by correct matches, as in Table II of the paper.
-
-        These are classical detectors with low settings, others, DeepDetect, and chance baselines.
-        """
+        """Return the features to compare by correct matches, as in Table II: with low settings."""
         low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
         own = [self.deepdetect_480(), *self.chance_baselines()]
         return without_repeats([*low, *self.others, *own])
 
     def standard_features(self) -> list[LocalFeature]:
-        """Return the features of the standard protocol.
-
-        These are classical detectors with default settings, others, DeepDetect with all keypoints
-        and with sparse ones, and chance baselines.
-        """
+        """Return the features of the standard protocol, chance baselines last."""
         ranked = {**STANDARD, **HESSIAN}
         chosen = [name for name in ranked if name in self.classical]
         # These features are measured twice: with the common descriptor, and with their own.

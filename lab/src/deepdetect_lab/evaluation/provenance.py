@@ -18,10 +18,7 @@ PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES)
 
 
 def provenance() -> dict[str, str]:
-    """Return the running "command", the "commit", "machine" and "versions" as texts.
-
-    Weights files and reports store them.
-    """
+    """Return command, commit, machine and versions as texts, to store in weights and reports."""
     program, *arguments = sys.argv or [""]
     name = Path(program).name
     command = ["deepdetect" if name == "__main__.py" else name, *arguments]

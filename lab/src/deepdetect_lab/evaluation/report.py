@@ -31,7 +31,7 @@ def where(rows: Iterable[Row], **wanted: Any) -> Rows:
 
 
 def mean(rows: Iterable[Row], name: Any) -> float | None:
-    """Return the mean of the rows' values of this name, ignoring None and NaN; None if empty."""
+    """Return the mean of the rows' values `name`, without None and NaN; None if none is left."""
     return mean_of(row[name] for row in rows)
 
 
@@ -56,10 +56,7 @@ class Table:
     note: str = ""
 
     def values(self) -> list[dict[str, Cell]]:
-        """Return the rows, each with its cells in column order.
-
-        NaN and infinite numbers become None, because JSON has neither.
-        """
+        """Return the rows with cells in column order. NaN and inf become None: JSON has neither."""
         return [
             {
                 title: None if isinstance(cell, float) and not math.isfinite(cell) else cell
@@ -228,10 +225,7 @@ not measured."""
 
 
 def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
-    """Draw a horizontal bar with its value for each name; return the bytes of a PNG file.
-
-    The bars of `highlighted` names have another colour.
-    """
+    """Return a PNG file of horizontal bars by name. `highlighted` bars have another colour."""
     figure = _figure(8, 0.32 * len(values) + 1)
     axes = figure.subplots()
     colors = ["C1" if name in highlighted else "C0" for name in values]
@@ -250,10 +244,7 @@ def line_chart(
     x_label: str,
     y_label: str,
 ) -> bytes:
-    """Draw each named line through its points (x, y); return the bytes of a PNG file.
-
-    A line with a single point is drawn as a marker.
-    """
+    """Return a PNG file of lines by name, each through its (x, y) points, with a legend."""
     figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
     axes.set_xlabel(x_label)

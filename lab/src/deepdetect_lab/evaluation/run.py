@@ -189,9 +189,9 @@ class Run:
         return {name: value if value.ndim else value.item() for name, value in kept.items()}
 
     def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, float]:
-        """Return the keypoints of an image and the seconds of detection, from the cache if there.
+        """Return the keypoints of an image and the seconds that detection took.
 
-        The keypoints of the last images are also kept in memory.
+        They are read from the cache if they are there.
         """
         name = f"{feature.detection} {file_digest(image)}"
         if name not in self._recent:

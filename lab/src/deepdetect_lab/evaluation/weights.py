@@ -240,10 +240,7 @@ def evaluate_foreground(
     equal_density: bool = False,
     quiet: bool = True,
 ) -> ForegroundScore:
-    """Measure the fraction of keypoints on the foreground of photographs.
-
-    The detector and `equal_density` are as in `evaluate_oxford`.
-    """
+    """Measure the fraction of keypoints on the foreground. Options are as in `evaluate_oxford`."""
     run = Run(Path(), quiet=quiet)
     rows = foreground_rows(run, [_feature(_of_paper(detector, equal_density))], images)
     known = [row for row in rows if row["density"] > 0]
@@ -258,8 +255,7 @@ def evaluate_foreground(
 def _of_paper(detector: Any, equal_density: bool) -> Any:
     """Return a copy of a DeepDetect that resizes images to 480x480, as in the paper.
 
-    If `equal_density`, its number of keypoints is that of the label. Detectors of other types are
-    returned unchanged.
+    Detectors of other types are returned unchanged.
     """
     if not isinstance(detector, DeepDetect):
         return detector

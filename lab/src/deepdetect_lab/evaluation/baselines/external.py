@@ -66,10 +66,7 @@ def find_feature(word: str) -> LocalFeature:
 
 
 def plugin_feature(target: str) -> LocalFeature:
-    """Make a local feature from a function, given as "package.module:function".
-
-    The module is installed, or it is in the current folder.
-    """
+    """Make a local feature from a function in a module that is installed or in this folder."""
     module, _, name = target.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)
@@ -121,10 +118,7 @@ def onnx_feature(
 
 
 class _Network(NamedTuple):
-    """A loaded ONNX file: the shapes of its inputs, the names of its outputs, and how to run it.
-
-    A dimension of a shape is an int if it is fixed; otherwise it is a name or None.
-    """
+    """A loaded ONNX file. `shapes` are those of its inputs; a free dimension is not an int."""
 
     shapes: list[list[Any]]
     outputs: list[str]
@@ -186,10 +180,7 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _maxima(logits: np.ndarray, descriptors: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the local maxima of (H, W) logits as keypoints, as a dict like that of a function.
-
-    Their descriptors are interpolated bilinearly in a (D, h, w) map and normalised to length 1.
-    """
+    """Return local maxima of (H, W) logits, with descriptors interpolated in a (D, h, w) map."""
     peaks = (logits == cv2.dilate(logits, MAP_WINDOW)) & (logits > MAP_LEAST_LOGIT)
     inner = slice(MAP_BORDER_PX, -MAP_BORDER_PX)
     xy = np.argwhere(peaks[inner, inner])[:, ::-1] + MAP_BORDER_PX

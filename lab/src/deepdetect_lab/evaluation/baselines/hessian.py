@@ -31,10 +31,7 @@ SIZE_PER_SIGMA = 5.0
 
 
 def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Compute the scale-normalised response |det Hessian| sigma^4, (H, W) float32.
-
-    The image is (H, W) uint8, or float32 in [0, 1].
-    """
+    """Compute the scale-normalised response |det Hessian| sigma^4 of an image, (H, W) float32."""
     scaled = gray.astype(np.float32) / 255 if gray.dtype == np.uint8 else gray
     smooth = cv2.GaussianBlur(scaled, (0, 0), sigma_px)
     second = np.array([[1, -2, 1]], np.float32)
@@ -67,7 +64,7 @@ HESSIAN: dict[str, LocalFeature] = {
         title,
         detect,
         PAPER_DESCRIPTOR.describe,
-        own_scale=OwnScaleDescriptor(0.5),  # 0.5 times 5 sigma; SIFT keypoints have size 2 sigma
+        own_scale=OwnScaleDescriptor(0.5),  # size 0.5 x 5 sigma; SIFT keypoints have 2 sigma
     )
     for name, title, detect in (
         ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),

@@ -56,7 +56,7 @@ class LocalFeature:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Name and version. Results depend on nothing else, except the images and the options."""
+        """Name and version, which identify the feature in the keys of cached results."""
         return self.name, self.version
 
 
@@ -122,10 +122,7 @@ def with_common_descriptor(feature: LocalFeature) -> LocalFeature:
 def _described(
     feature: LocalFeature, descriptor: PointDescriptor | OwnScaleDescriptor, name: str, title: str
 ) -> LocalFeature:
-    """Return a copy of a feature with another descriptor, which describes each position once.
-
-    SIFT's detector repeats some positions with other orientations. The repetitions are dropped.
-    """
+    """Return a copy with another descriptor. Repeated positions, as in SIFT, are described once."""
     return replace(
         feature,
         name=name,
@@ -147,10 +144,7 @@ def deepdetect_feature(
     descriptor: PointDescriptor = PAPER_DESCRIPTOR,
     version: str = "",
 ) -> LocalFeature:
-    """Make a local feature from a DeepDetect.
-
-    If a `version` is given, the detector may be any object with a method `heatmap`.
-    """
+    """Make a local feature from a DeepDetect, or from any detector with `heatmap` and a version."""
     if not version:
         digest = file_digest(detector.weights)[:16]
         version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"
@@ -162,10 +156,7 @@ def deepdetect_feature(
 
 
 def points_feature(ranker: str | Path | None = None) -> LocalFeature:
-    """Make a local feature from `PointDetector`: multi-scale keypoints ranked by a network.
-
-    They are found at native image resolution. `ranker` is the file of the network.
-    """
+    """Make a local feature from the ranked multi-scale keypoints of a `PointDetector`."""
     detector = PointDetector(None, resolution="native", ranker=ranker)
     return LocalFeature(
         "deepdetect-points",

@@ -151,7 +151,7 @@ def _shi_tomasi_eigenvalue(rgb: np.ndarray) -> Keypoints:
     if corners is not None:
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
         fine = cv2.cornerSubPix(gray, corners.copy(), (2, 2), (-1, -1), criteria)
-        # If refinement moves a corner by 1 px or more, it has not converged to it, so it is undone.
+        # A refinement by 1 px or more has not converged to this corner, so it is undone.
         stayed = np.abs(fine - corners).max(2, keepdims=True) < 1
         corners = np.where(stayed, fine, corners)
     return _corners(rgb, corners, scores)
@@ -190,10 +190,9 @@ and Shi-Tomasi differ from `CLASSICAL` so that they find enough keypoints and ra
 
 
 def with_kd_trees(features: Iterable[LocalFeature]) -> list[LocalFeature]:
-    """After each binary feature with low settings, insert a copy that kd-trees match.
+    """After binary features with low settings, insert copies whose bytes are matched as numbers.
 
-    The kd-trees take the bytes of the binary descriptors for numbers and compare them by Euclidean
-    distance, as the paper's code does.
+    In the paper, kd-trees match binary descriptors in this way, by the Euclidean distance of bytes.
     """
     found: list[LocalFeature] = []
     for feature in features:

@@ -99,9 +99,9 @@ def _kd_tree(points: np.ndarray) -> Any:
 
 
 def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each point's distance to the nearest point in the tree, and the index of the latter.
+    """Return for each point the index of the nearest point of the tree, after its distance.
 
-    Distances larger than the radius are returned as infinite.
+    Distances beyond the radius are infinite.
     """
     # An upper bound saves time. The tree leaves the bound itself out, so it must exceed the radius.
     bound = np.nextafter(radius_px, np.inf)
@@ -168,9 +168,9 @@ def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.
 
 
 def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the fraction of cells of `CELL_PX` squared that contain one of the (N, 2) keypoints.
+    """Return the fraction of an image's square cells that contain one of the (N, 2) keypoints.
 
-    `size` is the (width, height) of the image. Cells at its right and lower border may be smaller.
+    `size` is (width, height). Cells at the right and lower border may be smaller than `CELL_PX`.
     """
     columns, rows = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
     position = np.floor((np.asarray(xy, np.float64).reshape(-1, 2) + 0.5) / CELL_PX).astype(int)

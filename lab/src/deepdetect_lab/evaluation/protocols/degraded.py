@@ -30,10 +30,7 @@ TEXT = (
 def degraded_sections(
     run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], key: str, title: str
 ) -> list[Section]:
-    """Run the standard protocol for each degradation, if the protocol "degraded" is requested.
-
-    `key` begins the keys of the tables, and `title` the titles of the sections.
-    """
+    """Run the standard protocol with each degradation, if "degraded" is among the protocols."""
     sections = []
     for name, degradation in DEGRADATIONS.items() if "degraded" in options.protocols else ():
         made = (
@@ -47,10 +44,7 @@ def degraded_sections(
 
 
 def degraded_pair(pair: PlanarPair, degradation: Degradation, folder: Path) -> PlanarPair:
-    """Return the pair with a degraded copy of its second image.
-
-    The copy is a file in the folder. It is created if it does not exist.
-    """
+    """Return the pair with a degraded copy of its second image, a file that is made if missing."""
     digest = file_digest(pair.second)[:16]
     path = folder / "degraded" / f"{digest}-{degradation.name}-v{degradation.version}.png"
     if not path.exists():

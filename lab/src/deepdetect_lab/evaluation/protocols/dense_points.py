@@ -254,11 +254,7 @@ def read_ply_points(path: Path) -> np.ndarray:
     """Read the points of a PLY file from any program, (N, 3) float64, without non-finite ones.
 
     The package plyfile reads them, because files from OpenMVS contain lists, on which the readers
-    of OpenCV, COLMAP and trimesh fail.
-
-    Raises:
-        MissingFileError: there is no such file.
-        InvalidFileError: the file is not a PLY file with points.
+    of OpenCV, COLMAP and trimesh fail. An InvalidFileError is raised for other files.
     """
     try:
         head, end, rest = path.read_bytes().partition(b"end_header")

@@ -100,16 +100,14 @@ def guided_sections(
         "By descriptors alone: the paper's matching (SIFT of size 3, FLANN, ratio 0.99). Guided: "
         "guided matching, the default of `match_images`; the true homography is only used for "
         "evaluation. "
-        f"DeepDetect gets images resized to 480x480 as {options.channels.upper()}."
+        "DeepDetect gets images resized to 480x480, with colours in the order "
+        f"{options.channels.upper()}."
     )
     return [Section(f"{title}, descriptors alone and guided", (text,), tables)]
 
 
 def guided_row(run: Run, feature: LocalFeature, by_truth: Mapping[str, PlanarPair]) -> Row:
-    """Match an image pair; return the cells of `COLUMNS` by the name of the ground truth.
-
-    `by_truth` maps this name to the pair with the homography of this ground truth.
-    """
+    """Match an image pair; return the cells of `COLUMNS` for each ground truth, by its name."""
     pair = next(iter(by_truth.values()))
     images = (pair.first, pair.second)
     alone = run.matches(feature, images, PAPER_MATCHING)
@@ -153,10 +151,7 @@ def _guided_cells(
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Name the geometric models that guided the matching, given the model of each seed.
-
-    If some seeds were not guided ("none"), the number of guided seeds is added.
-    """
+    """Name the models that guided the seeds, and the number of guided seeds if not all were."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):

@@ -94,7 +94,7 @@ def sample_images(folder: str | Path) -> list[Path]:
     """List the images `image_*.png` in a folder that also holds their masks `mask_image_*.png`.
 
     Raises:
-        ImageError: the folder has no samples.
+        ImageError: there are no such images.
     """
     images = sorted(Path(folder).glob("image_*.png"))
     if not images:
@@ -121,20 +121,14 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def score_samples(
     heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, MaskScore]:
-    """Score a function from RGB images to heat maps on images with masks.
-
-    Returns a score for each visibility of images, "normal" and "low".
-    """
+    """Score a function from RGB images to heat maps on images with masks, by their visibility."""
     return _by_visibility(
         (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
     )
 
 
 def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScore]:
-    """Combine measured images with "normal" and with "low" visibility to a score each.
-
-    A visibility without images has no score.
-    """
+    """Combine measured images to a score for each visibility, "normal" or "low", that occurs."""
     measured: dict[str, list[Measured]] = {"normal": [], "low": []}
     for visibility, one in images:
         measured[visibility].append(one)

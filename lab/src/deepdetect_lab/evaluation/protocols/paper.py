@@ -129,10 +129,7 @@ def repeatability_table(
 def repeatability_rows(
     run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene]
 ) -> Rows:
-    """Measure the repeatability, as the paper defines it, of each feature on each pair.
-
-    Rows hold it as "repeatability", and also the "scene".
-    """
+    """Measure the paper's repeatability of each pair; rows hold "repeatability" and "scene"."""
 
     def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
         return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
@@ -148,10 +145,7 @@ def matches_table(
     key: str,
     title: str = "Correct matches",
 ) -> Table:
-    """Tabulate the number of correct matches (error under 1 px) and their fraction of all matches.
-
-    There is a row for each feature and two columns for each pair.
-    """
+    """Tabulate for each pair the number of matches with an error under 1 px, and their fraction."""
 
     def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
         correct, matches = correct_matches(run, feature, pair)
@@ -245,9 +239,9 @@ def correct_matches(
 
 
 def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> tuple[int, int]:
-    """Return the numbers of `correct_matches` as means over FLANN seeds, rounded to integers.
+    """Return the numbers of correct and of all matches, as rounded means over FLANN seeds.
 
-    There are `SEEDS` seeds, or `MANY_SEEDS` if there are fewer than `FEW_MATCHES` correct matches.
+    If there are fewer than `FEW_MATCHES` correct ones, `MANY_SEEDS` seeds are used, else `SEEDS`.
     """
     counts: list[tuple[int, int]] = []
     for seed in range(MANY_SEEDS):
@@ -283,10 +277,7 @@ def mask_figure(scene: PlanarScene) -> Figure:
 
 
 def match_figure(run: Run, feature: LocalFeature, number: str, pair: PlanarPair) -> Figure:
-    """Draw the paper's Figure 6 or 7: a random sample of a pair's matches; correct ones are green.
-
-    `number` is the beginning of the caption, for example "Figure 6".
-    """
+    """Draw Figure 6 or 7 of the paper: a random sample of a pair's matches, correct ones green."""
     found = run.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
     correct = transfer_errors(found.points0, found.points1, pair.homography) < CORRECT_PX
     drawn = draw_matches(

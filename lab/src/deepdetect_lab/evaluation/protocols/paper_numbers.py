@@ -44,10 +44,7 @@ def paper_title(title: str) -> str:
 
 
 def with_paper_rows(table: Table, paper: Paper) -> Table:
-    """Insert a row with the paper's numbers below each of our rows.
-
-    Rows of the paper that our table does not have come last.
-    """
+    """Insert the paper's numbers as a row below each of ours. The paper's other rows come last."""
     first, *titles = table.columns
     ours = [row[first] for row in table.rows]
     rows: Rows = []
@@ -62,10 +59,7 @@ def with_paper_rows(table: Table, paper: Paper) -> Table:
 
 
 def with_paper_column(table: Table, title: str, paper: Mapping[str, float]) -> Table:
-    """Insert a column with the paper's numbers to the right of the column `title`.
-
-    `paper` maps the titles of rows to numbers.
-    """
+    """Insert the paper's numbers, given by row title, as a column to the right of `title`."""
     columns: dict[str, str] = {}
     for name, style in table.columns.items():
         columns[name] = style

@@ -68,7 +68,7 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
         by_truth[truth] = [scene.with_max_pairs(options.max_pairs) for scene in of_truth]
     scenes = by_truth["published"]
     if missing := [name for name in OXFORD_KINDS if name not in {scene.name for scene in scenes}]:
-        run.skipped.append(f"Oxford's {', '.join(missing)}: not in {folder}")
+        run.skipped.append(f"Oxford's {', '.join(missing)}: there is no such scene in {folder}")
     pairs = pairs_of(scenes)
     unrefined = [
         pair.name
@@ -80,7 +80,7 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
         del by_truth["refined"]
     if unrefined and {*options.protocols} - {"paper"}:
         run.skipped.append(
-            f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined "
+            f"refined homographies of {', '.join(unrefined)}: there are no files H1toKp.refined "
             "(run benchmarks/refine_oxford.py); published homographies are used for these pairs"
         )
     sections = _oxford_paper(run, options, scenes)
@@ -204,10 +204,9 @@ def _hpatches_paper(
 
 
 def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
-    """Make the HPatches half of Table III: mean repeatability of each kind of scene.
+    """Average the repeatability of scenes with changing light and of those with changing viewpoint.
 
-    `by_scene` has a column for each scene. `light` tells by scene whether its light changes;
-    otherwise its viewpoint changes.
+    `by_scene` has a column for each scene. `light` maps a scene to True if its light changes.
     """
     titles = {}
     rows: Rows = [{"method": row["method"]} for row in by_scene.rows]
@@ -261,9 +260,6 @@ def pairs_of(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:
 def select_pairs(
     scenes: Sequence[PlanarScene], chosen: Sequence[tuple[str, int]]
 ) -> list[PlanarPair]:
-    """Return the chosen pairs, each given by its scene and the number of its second image.
-
-    Chosen pairs that do not exist are left out.
-    """
+    """Return the chosen pairs, given as (scene, number of the second image), that exist."""
     found = {(pair.scene, pair.number): pair for pair in pairs_of(scenes)}
     return [found[name] for name in chosen if name in found]

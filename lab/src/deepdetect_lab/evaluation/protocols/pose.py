@@ -155,7 +155,7 @@ def _match_unguided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
 
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
-    """Make a method that matches a feature exactly, with a ratio test unless it is learned."""
+    """Make a method that matches descriptors exactly, with a ratio test unless they are learned."""
     ratio, test = (math.inf, "no ratio test") if feature.learned else (RATIO, f"ratio {RATIO:g}")
     settings = MatchSettings("exact", ratio, mutual=True, budget=BUDGET)
 
@@ -200,10 +200,7 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
 
 
 def pose_errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
-    """Return errors of a pose (rotation, translation) by column title, in degrees.
-
-    They are infinite if the pose is None.
-    """
+    """Return the errors of a pose in degrees by column title. They are infinite without a pose."""
     rotation = translation = float("inf")
     if pose is not None:
         rotation = rotation_error(pose[0], pair.rotation)

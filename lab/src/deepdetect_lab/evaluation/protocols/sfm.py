@@ -118,19 +118,12 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class SfmMethod:
-    """A method that the benchmark compares.
+    """A method that the benchmark compares. `name` is its title in the tables.
 
-    Attributes:
-        name: title in the tables.
-        find: function that finds keypoints in a folder of images and writes them to the file
-            `features` of the stages.
-        match: function that returns the matches of image pairs.
-        version: text that identifies cached results, together with the name.
-        chance: the method is a chance baseline, and the time of `find` is not reported.
-        refined: COLMAP's tracks are refined.
-        tracks: value of the option `matches`.
-
-    The functions must be defined at the level of a module, because another process runs them.
+    `find` writes the keypoints of a folder of images to a file, and `match` returns the matches of
+    image pairs. Both must be module-level functions, because another process runs them. `name` and
+    `version` identify cached results. If `chance` is set, the time of `find` is not reported. If
+    `refined` is set, COLMAP's tracks are refined. `tracks` is the value of the option `matches`.
     """
 
     name: str
@@ -196,7 +189,7 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
-    """Return two methods with ranked points, two with SIFT if it is chosen, and one with chance."""
+    """Return two methods with ranked points, two with SIFT if chosen, and the chance baseline."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
     version, random = _version(points), "baseline: as many random points"
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
@@ -240,9 +233,9 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
 
 
 def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
-    """Measure the dense points of a scene, or read the values from the cache.
+    """Measure the dense points of a scene: a row for DeepDetect, and one for OpenCV's SGBM.
 
-    Returns a row for DeepDetect and one for OpenCV's semi-global matching.
+    The values are read from the cache if they are there.
     """
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
@@ -298,9 +291,9 @@ Views = Mapping[str, PosedView]
 
 
 def _apart(views: Views, others: Views, truth: Views) -> float | None:
-    """Return the mean distance between the camera centres of two models after their alignment.
+    """Align the camera centres of two models, and return their mean distance.
 
-    It is in the unit of the ground truth. It is None if the models share fewer than three images.
+    It is in the unit of the ground truth, or None if the models share fewer than three images.
     """
     names = sorted(set(views) & set(others))
     if len(names) < MIN_IMAGES:
@@ -358,10 +351,9 @@ def find_sift(stages: Stages, folder: Path) -> None:
 
 
 def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-    """Match SIFT keypoints by pycolmap's matcher with its defaults.
+    """Match SIFT keypoints by pycolmap's matcher with its defaults, without verification.
 
-    Its geometric verification is switched off, because a later stage verifies the matches of all
-    methods in the same way.
+    A later stage verifies the matches of all methods in the same way.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureMatchingOptions()
@@ -414,7 +406,7 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
             model, seconds = None, np.nan
             if known or kind == "estimated":
                 cpu = time.process_time()
-                with contextlib.suppress(NoDepthError):  # then there is no model, also a result
+                with contextlib.suppress(NoDepthError):  # a failed reconstruction is also a result
                     model = stages.map(folder, intrinsics, matches, bool(known), method.refined)[0]
                 seconds = time.process_time() - cpu
             row[MAPPING_CPU.format(kind)] = seconds

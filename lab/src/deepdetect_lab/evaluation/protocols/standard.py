@@ -53,8 +53,8 @@ measured."""
 INLIER_THRESHOLD_PX = 3.0
 
 MIN_FILLED = 0.9
-"""A result at a budget is shown if the method fills at least this fraction of it on average, because
-otherwise methods would be compared at different numbers of keypoints. Chosen by hand."""
+"""A result at a budget is shown if the method finds at least this fraction of the budget, on mean,
+because otherwise methods would be compared at different numbers of keypoints. Chosen by hand."""
 
 MAX_CHANCE = 0.95
 """Chance-corrected values are left out if the chance level is above this, since the correction
@@ -84,10 +84,7 @@ def standard_section(
     title: str,
     text: str,
 ) -> Section:
-    """Measure all features on all pairs; return a section of the report with the tables.
-
-    `key` begins the keys of the tables, `title` names the data, and `text` is the paragraph.
-    """
+    """Measure all features on all pairs; return a section of the report with the tables."""
     features = options.standard_features()
     rows = standard_rows(run, features, pairs)
     what = f"{title} ({len(pairs)} pairs)"

@@ -126,11 +126,7 @@ def points_table(
     which: str,
     truth: np.ndarray | None,
 ) -> Table:
-    """Tabulate the number and accuracy of the points, time and memory of each pipeline.
-
-    `found` maps names of pipelines to rows of `reconstruct_points`. `which` names the version of
-    the ground truth, and `truth` is its disparity map, or None if there is none.
-    """
+    """Tabulate points, time and memory of each pipeline, and errors if `truth` is not None."""
     columns = {
         **{"pipeline": "", "points": ",d", "of them filled": ",d"},
         **{f"1 - bad-{tolerance:g}": ".4f" for tolerance in DISPARITY_TOLERANCES_PX},
@@ -164,10 +160,7 @@ def _triangulate(
 def clouds_figure(
     pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, Row]
 ) -> Figure | None:
-    """Draw the paper's Figure 8: the point clouds of the pipelines that have a title in it.
-
-    Returns None if these pipelines have no points.
-    """
+    """Draw Figure 8 with the clouds of the pipelines that the paper draws; None without points."""
     clouds = {}
     # Our pipeline comes last, as in the paper.
     for pipeline in sorted(compared, key=lambda pipeline: pipeline.drawn == "ours"):

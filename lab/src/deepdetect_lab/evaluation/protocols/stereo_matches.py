@@ -46,10 +46,7 @@ def score_stereo_matches(
 
 
 def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None = None) -> Matches:
-    """Match the two views by descriptors alone, without estimating a geometry.
-
-    With a `density`, keypoints are the most probable pixels up to this fraction of the image.
-    """
+    """Match the two views by descriptors alone, without estimating a geometry."""
     selection = SelectionOptions(density=density)
     return match_unguided(
         pair.left, pair.right, detector, selection=selection, descriptor=UPRIGHT_SIFT

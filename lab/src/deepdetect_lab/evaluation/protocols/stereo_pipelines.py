@@ -37,15 +37,11 @@ matched."""
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """A pipeline that finds disparities in a stereo pair.
+    """A pipeline that finds disparities in a stereo pair. `name` is its title in tables.
 
-    Attributes:
-        name: title in tables.
-        prepare: function that does untimed work for a stereo pair and returns the timed function.
-        version: text that identifies cached results, together with the name.
-        rounds: number of timed runs.
-        drawn: title in Figure 8; "" if the pipeline is not drawn.
-        paper: number of points that the paper gives for each scene.
+    `prepare` does untimed work and returns the function to time, which is run `rounds` times.
+    `name` and `version` identify cached results. `drawn` is the title in Figure 8, or "" if the
+    pipeline is not drawn. `paper` maps scenes to the numbers of points that the paper gives.
     """
 
     name: str
@@ -179,8 +175,7 @@ def essential_inliers(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the matches that are inliers of the essential matrix.
 
-    The matches are also triangulated. The points are not used, but the time counts, as the paper's
-    pipeline triangulates.
+    They are also triangulated, because the paper's pipeline does so and its time is measured.
     """
     if len(points0) < 6:
         return points0[:0], points1[:0]
