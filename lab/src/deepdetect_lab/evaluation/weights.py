@@ -41,14 +41,11 @@ class OxfordScore:
     Attributes:
         density: for each of the paper's thresholds, the number of keypoints per pixel, mean over
             all images. With `equal_density` only the first threshold is a key.
-        repeatability: for each scene, the repeatability as the paper defines it, mean over the
-            five pairs.
+        repeatability: the paper's repeatability of each scene, mean over its five pairs.
         correct: for each pair, the number of matches (FLANN, ratio 0.99) with an error under 1 px
             by the published homography, mean over several seeds of FLANN.
-        matches: for each pair, the number of all matches that pass the ratio test, mean over the
-            same seeds.
-        failures: a sentence for each image or pair that could not be measured. The means leave
-            these out.
+        matches: for each pair, the number of all matches, mean over the same seeds.
+        failures: a sentence for each image or pair that failed. The means leave these out.
     """
 
     density: dict[float, float]
@@ -83,8 +80,7 @@ class Evaluation:
     """Scores of weights, as returned by `evaluate`.
 
     Attributes:
-        masks: agreement of heat maps with the known masks of images, by the visibility of the
-            images ("normal" or "low").
+        masks: agreement of heat maps with known masks, by visibility ("normal" or "low").
         scales: agreement of the heat maps of scaled images with labels made from these images, by
             (scale, visibility).
         oxford: scores by the paper's protocol on the Oxford scenes.
@@ -151,8 +147,7 @@ def evaluate(
         raise OptionError("`scales` needs images to scale: also name their folder as `samples`")
     if equal_density and oxford is None and foreground is None:
         raise OptionError(
-            "`equal_density` only changes the scores of `oxford` and `foreground`: "
-            "also name a folder as one of them"
+            "`equal_density` only affects `oxford` and `foreground`: also name a folder as one"
         )
     scenes = None if oxford is None else load_oxford(oxford)
     masked = None if foreground is None else load_foreground(foreground)

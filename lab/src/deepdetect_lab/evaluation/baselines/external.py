@@ -43,7 +43,7 @@ from .opencv import CLASSICAL
 MAP_SIDE, MAP_BORDER_PX, MAP_LEAST_LOGIT, MAP_WINDOW = 32, 4, -5, np.ones((5, 5), np.uint8)
 """Settings for ONNX files that output maps; the values are those of EdgePoint2. Image sides are
 resized to multiples of `MAP_SIDE` pixels. Keypoints are at least `MAP_BORDER_PX` from the border,
-have a logit over `MAP_LEAST_LOGIT`, and are the maximum of a window of the size `MAP_WINDOW`."""
+have a logit over `MAP_LEAST_LOGIT`, and are the maximum of the window `MAP_WINDOW` around them."""
 
 
 def find_feature(word: str) -> LocalFeature:
@@ -60,9 +60,7 @@ def find_feature(word: str) -> LocalFeature:
     try:
         return look_up("method", word, {**CLASSICAL, **HESSIAN})
     except OptionError as error:
-        raise OptionError(
-            f"{error}; or give an ONNX file, or a function as package.module:function"
-        ) from None
+        raise OptionError(f"{error}; or give an ONNX file or package.module:function") from None
 
 
 def plugin_feature(target: str) -> LocalFeature:
@@ -74,8 +72,7 @@ def plugin_feature(target: str) -> LocalFeature:
         function = getattr(importlib.import_module(module), name)
     except Exception as error:  # the module's code may raise anything
         raise OptionError(
-            f"{target} cannot be imported ({first_line(error)}): "
-            "give an importable function as package.module:function"
+            f"{target} cannot be imported ({first_line(error)}): give package.module:function"
         ) from None
     finally:
         sys.path.remove(here)
@@ -105,9 +102,7 @@ def onnx_feature(
         raise WeightsError(f"{file} is not a usable ONNX file ({first_line(error)})") from None
     shapes = network.shapes
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] not in (1, 3):
-        raise WeightsError(
-            f"{file} must have one input, 1x3xHxW (RGB) or 1x1xHxW (grey), not {shapes}"
-        )
+        raise WeightsError(f"{file} must have one input, 1x3xHxW or 1x1xHxW, not {shapes}")
     if "scores" not in network.outputs or not {"keypoints", "descriptors"} & {*network.outputs}:
         raise WeightsError(
             f"{file} must have the outputs 'scores' and 'keypoints', or the maps 'scores' and "

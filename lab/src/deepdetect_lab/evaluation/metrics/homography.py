@@ -58,7 +58,7 @@ def match_accuracy(
     1 to 10: ("correct", px) is the number of matches with an error of at most px. ("precision", px)
     is their fraction of all matches, called matching accuracy by D2-Net. ("score", px) is
     Mikolajczyk's matching score: the number of correct matches between points that both images
-    show, divided by the smaller number of keypoints that the respective other image shows.
+    show, divided by the number of keypoints in the overlap, in the image that has fewer there.
     """
     errors = transfer_errors(points0, points1, homography)
     back = np.linalg.inv(homography)

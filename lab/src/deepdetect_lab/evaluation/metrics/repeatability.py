@@ -40,7 +40,7 @@ def repeatability_paper(
     """Return the repeatability as the paper's code computes it, clipped at 1.
 
     It is the number of points of the first image that the homography maps strictly closer than the
-    radius to any point of the second image, divided by the smaller number of points in one image.
+    radius to any point of the second, divided by the number of points in the image that has fewer.
     Points outside the overlap of the images count, several points may share a partner, and the
     chance level is not subtracted.
     """
@@ -99,7 +99,7 @@ def _kd_tree(points: np.ndarray) -> Any:
 
 
 def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each point the index of the nearest point of the tree, after its distance.
+    """For each point, return the distance to the nearest point of the tree, and its tree index.
 
     Distances beyond the radius are infinite.
     """

@@ -52,7 +52,7 @@ DENSE_COLUMNS = {
 
 DENSE_NOTE = (
     "True intrinsics are used where they are known. Share, own map: fraction of the pixels of the "
-    "depth maps' grid that have a point in the image's own depth map; share, all maps: fraction "
+    "depth maps that have a point in the image's own depth map; share, all maps: fraction of them "
     "that see any point of the fused cloud. Both are means over the images. Error: distance in "
     "pixels between a point and the matches of the image whose depth map gave the point. Halves: "
     "every other image belongs to the first half, the rest to the second, and each half gets its "
@@ -92,9 +92,7 @@ def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
     """
     sparse = model / "sparse" / "0"
     if not sparse.is_dir():
-        raise MissingFileError(
-            f"there is no folder {sparse}: name the folder of a reconstruction that contains it"
-        )
+        raise MissingFileError(f"there is no folder {sparse}: name the folder of a reconstruction")
     pycolmap = import_pycolmap()
     try:
         views = read_sparse_model(pycolmap.Reconstruction(sparse)).views.values()
@@ -266,7 +264,5 @@ def read_ply_points(path: Path) -> np.ndarray:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except (plyfile.PlyParseError, OSError, KeyError, ValueError, MemoryError) as error:
         reason = first_line(error) or type(error).__name__
-        raise InvalidFileError(
-            f"{path} is not a PLY file with points ({reason}): check the file"
-        ) from error
+        raise InvalidFileError(f"{path} is not a PLY file with points ({reason})") from error
     return points[np.isfinite(points).all(axis=1)]

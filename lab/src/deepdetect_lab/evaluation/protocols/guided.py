@@ -55,8 +55,7 @@ NOTE = (
     "matches divided by that of matchable points; lowest: the smallest such fraction of a seed. "
     "Unique: correct matches, where each point of the second image counts once. A seed that finds "
     "no trusted geometry has no matches, as in match_images. Corner error: median over the seeds "
-    "that a homography guided. Seconds: median time of guided matching without finding keypoints, "
-    "measured when it was computed."
+    "that a homography guided. Seconds: median time of guided matching, without detection."
 )
 
 
@@ -100,8 +99,7 @@ def guided_sections(
         "By descriptors alone: the paper's matching (SIFT of size 3, FLANN, ratio 0.99). Guided: "
         "guided matching, the default of `match_images`; the true homography is only used for "
         "evaluation. "
-        "DeepDetect gets images resized to 480x480, with colours in the order "
-        f"{options.channels.upper()}."
+        f"DeepDetect gets {options.channels.upper()} images resized to 480x480."
     )
     return [Section(f"{title}, descriptors alone and guided", (text,), tables)]
 

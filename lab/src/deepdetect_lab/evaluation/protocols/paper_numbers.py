@@ -44,7 +44,7 @@ def paper_title(title: str) -> str:
 
 
 def with_paper_rows(table: Table, paper: Paper) -> Table:
-    """Insert the paper's numbers as a row below each of ours. The paper's other rows come last."""
+    """Insert the paper's numbers as rows below ours. Rows that only the paper has come last."""
     first, *titles = table.columns
     ours = [row[first] for row in table.rows]
     rows: Rows = []

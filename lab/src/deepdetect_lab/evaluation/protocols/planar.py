@@ -57,10 +57,9 @@ NOTHING_MOVES = "Nothing moves between the images of a scene: the true homograph
 
 
 def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the chosen protocols on the scenes of Oxford.
+    """Run the chosen protocols on Oxford, for Tables I to III and Figures 1, 2, 4, 6 of the paper.
 
-    The paper's protocol gives Tables I and II, the Oxford half of Table III, and Figures 1, 2, 4
-    and 6.
+    "refined" homographies are used as well, if their files exist.
     """
     folder = run.folder("oxford")
     by_truth = {"published": load_oxford(folder), "refined": load_oxford(folder, "refined")}
@@ -107,10 +106,9 @@ def _oxford_paper(
     drawn = [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
     figure_6, figures = _figures(run, options, figure_6_pairs, "oxford", drawn)
     text = (
-        "This section has the paper's Tables I and II, the Oxford half of Table III, and Figures "
-        "1, 2, 4 and 6. The paper's numbers are next to ours. DeepDetect gets images resized to "
-        f"480x480 with colours in the order {options.channels.upper()}; the classical detectors "
-        "get the original images."
+        "Tables I and II of the paper, the Oxford half of Table III, and Figures 1, 2, 4 and 6, "
+        f"with the paper's numbers next to ours. DeepDetect gets {options.channels.upper()} images "
+        "resized to 480x480; the classical detectors get the original images."
     )
     tables = [
         density,
@@ -156,10 +154,9 @@ def _drawn(
 
 
 def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the chosen protocols on the scenes of HPatches.
+    """Run the chosen protocols on HPatches, for the paper's Table III and Figure 7.
 
-    The paper's protocol gives the HPatches half of Table III, and Figure 7. The standard protocol
-    is run on all scenes and also on the subset that D2-Net's paper uses.
+    The standard protocol is run on all scenes, and also on the subset that D2-Net's paper uses.
     """
     found = load_hpatches(run.folder("hpatches"))
     scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]

@@ -289,8 +289,8 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
     note = (
         f"{NOTE} Guided by: number of pairs whose matching a homography or a fundamental matrix "
         "guided; unguided: pairs for which no geometry was trusted. Worse than SIFT: number of "
-        f"pairs for which SIFT's error is under {GOOD_DEG:g}° and this method's is not; better: "
-        "the reverse. Seconds: median time from images to matches, measured when it was computed."
+        f"pairs with an error of {GOOD_DEG:g}° or more, while SIFT's is under {GOOD_DEG:g}°; "
+        "better: the reverse. Seconds: median time from images to matches."
     )
     groups = [{"scene": scene.name} for scene in scenes]
     return tabulate("pose", "Relative poses", methods, rows, columns, note, groups)

@@ -70,9 +70,7 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
     folder = run.folder("middlebury")
     scenes = {path.parent.name: path.parent for path in sorted(folder.glob("*/left.png"))}
     if not scenes:
-        raise ImageError(
-            f"there are no scenes in {folder}: put folders there that hold left.png and right.png"
-        )
+        raise ImageError(f"{folder} has no folders with left.png and right.png: put scenes there")
     compared = pipelines(options)
     rows = run.rows("", compared, scenes, partial(reconstruct_points, run))
     tables: list[Table] = []

@@ -201,8 +201,8 @@ def essential_inliers(
 def sgbm(scene: CalibratedStereoPair) -> Points:
     """Match every pixel by OpenCV's semi-global matching.
 
-    The range of disparities is that which our pipeline finds, extended to start at 0 or below. The
-    views are extended by this range, so that pixels near the borders also get disparities.
+    The range of disparities is the one that our pipeline finds, extended to start at 0 or below.
+    The views are extended by this range, so that pixels near the borders also get disparities.
     """
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
     search = find_disparity_range(*gray)
