@@ -98,7 +98,7 @@ class BenchmarkOptions:
         return self.detector.configured(HeatmapOptions("native", self.channels))
 
     def deepdetect_native(self) -> LocalFeature:
-        """Return DeepDetect at native resolution, with all pixels of probability over 0.5."""
+        """Return DeepDetect at native resolution. Keypoints are pixels with probability over 0.5."""
         title = "DeepDetect, native resolution, all pixels over 0.5"
         return deepdetect_feature(self.native_detector(), name="deepdetect-native", title=title)
 
@@ -113,7 +113,7 @@ class BenchmarkOptions:
         return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
 
     def matching_features(self) -> list[LocalFeature]:
-        """Return the features to compare by correct matches, as in Table II: with low settings."""
+        """Return the features of the paper's Table II, low-setting detectors and DeepDetect."""
         low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
         own = [self.deepdetect_480(), *self.chance_baselines()]
         return without_repeats([*low, *self.others, *own])

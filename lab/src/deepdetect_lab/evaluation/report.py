@@ -225,7 +225,7 @@ not measured."""
 
 
 def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
-    """Return a PNG file of horizontal bars by name. `highlighted` bars have another colour."""
+    """Draw a horizontal bar for each name, as PNG. `highlighted` bars have another colour."""
     figure = _figure(8, 0.32 * len(values) + 1)
     axes = figure.subplots()
     colors = ["C1" if name in highlighted else "C0" for name in values]
@@ -244,7 +244,7 @@ def line_chart(
     x_label: str,
     y_label: str,
 ) -> bytes:
-    """Return a PNG file of lines by name, each through its (x, y) points, with a legend."""
+    """Draw a line through the (x, y) points of each name, with a legend, as PNG."""
     figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
     axes.set_xlabel(x_label)

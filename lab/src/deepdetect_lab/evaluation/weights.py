@@ -147,7 +147,7 @@ def evaluate(
         raise OptionError("`scales` needs images to scale: also name their folder as `samples`")
     if equal_density and oxford is None and foreground is None:
         raise OptionError(
-            "`equal_density` only affects `oxford` and `foreground`: also name a folder as one"
+            "`equal_density` only affects `oxford` and `foreground`: also name one of these folders"
         )
     scenes = None if oxford is None else load_oxford(oxford)
     masked = None if foreground is None else load_foreground(foreground)

@@ -64,7 +64,7 @@ def find_feature(word: str) -> LocalFeature:
 
 
 def plugin_feature(target: str) -> LocalFeature:
-    """Make a local feature from a function in a module that is installed or in this folder."""
+    """Make a local feature from an importable function. Its module may be in the current folder."""
     module, _, name = target.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)
@@ -175,7 +175,7 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _maxima(logits: np.ndarray, descriptors: np.ndarray) -> dict[str, np.ndarray]:
-    """Return local maxima of (H, W) logits, with descriptors interpolated in a (D, h, w) map."""
+    """Return local maxima of (H, W) logits as keypoints, with descriptors from a (D, h, w) map."""
     peaks = (logits == cv2.dilate(logits, MAP_WINDOW)) & (logits > MAP_LEAST_LOGIT)
     inner = slice(MAP_BORDER_PX, -MAP_BORDER_PX)
     xy = np.argwhere(peaks[inner, inner])[:, ::-1] + MAP_BORDER_PX

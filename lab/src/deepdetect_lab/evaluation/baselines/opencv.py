@@ -94,7 +94,7 @@ def _opencv(name: str) -> LocalFeature:
 
 
 def self_described(name: str) -> LocalFeature:
-    """Make a local feature that detects and describes with the same of the `OPENCV_SETTINGS`."""
+    """Make a local feature that detects and also describes with these `OPENCV_SETTINGS`."""
     return replace(
         _opencv(name),
         name=f"{name}-self-described",

@@ -264,5 +264,5 @@ def read_ply_points(path: Path) -> np.ndarray:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except (plyfile.PlyParseError, OSError, KeyError, ValueError, MemoryError) as error:
         reason = first_line(error) or type(error).__name__
-        raise InvalidFileError(f"{path} is not a PLY file with points ({reason})") from error
+        raise InvalidFileError(f"{path} is not a PLY point cloud ({reason}): check it") from error
     return points[np.isfinite(points).all(axis=1)]

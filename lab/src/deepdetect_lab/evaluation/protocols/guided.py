@@ -55,7 +55,7 @@ NOTE = (
     "matches divided by that of matchable points; lowest: the smallest such fraction of a seed. "
     "Unique: correct matches, where each point of the second image counts once. A seed that finds "
     "no trusted geometry has no matches, as in match_images. Corner error: median over the seeds "
-    "that a homography guided. Seconds: median time of guided matching, without detection."
+    "that a homography guided. Seconds: median time of guided matching without finding keypoints."
 )
 
 

@@ -121,7 +121,7 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def score_samples(
     heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, MaskScore]:
-    """Score a function from RGB images to heat maps on images with masks, by their visibility."""
+    """Score a function from RGB images to heat maps on images with masks, for each visibility."""
     return _by_visibility(
         (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
     )

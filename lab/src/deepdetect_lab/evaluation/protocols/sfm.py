@@ -293,7 +293,8 @@ Views = Mapping[str, PosedView]
 def _apart(views: Views, others: Views, truth: Views) -> float | None:
     """Align the camera centres of two models, and return their mean distance.
 
-    It is in the unit of the ground truth, or None if the models share fewer than three images.
+    The distance is in the unit of the ground truth. It is None if the models share fewer than
+    three images.
     """
     names = sorted(set(views) & set(others))
     if len(names) < MIN_IMAGES:

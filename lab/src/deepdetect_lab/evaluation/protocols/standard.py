@@ -53,8 +53,8 @@ measured."""
 INLIER_THRESHOLD_PX = 3.0
 
 MIN_FILLED = 0.9
-"""A result at a budget is shown if the method finds at least this fraction of the budget, on mean,
-because otherwise methods would be compared at different numbers of keypoints. Chosen by hand."""
+"""A result at a budget is only shown if the method finds, on average, at least this fraction of the
+budget, because otherwise the numbers of keypoints would differ between methods. Chosen by hand."""
 
 MAX_CHANCE = 0.95
 """Chance-corrected values are left out if the chance level is above this, since the correction
