@@ -98,7 +98,7 @@ class BenchmarkOptions:
         return self.detector.configured(HeatmapOptions("native", self.channels))
 
     def deepdetect_native(self) -> LocalFeature:
-        """Return DeepDetect at native resolution. Keypoints are pixels with probability over 0.5."""
+        """Return DeepDetect at native resolution. Pixels with probability > 0.5 are keypoints."""
         title = "DeepDetect, native resolution, all pixels over 0.5"
         return deepdetect_feature(self.native_detector(), name="deepdetect-native", title=title)
 
