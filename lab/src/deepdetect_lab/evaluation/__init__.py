@@ -1,4 +1,4 @@
-"""Metrics, baselines, protocols and reports."""
+"""Evaluate detectors: metrics, baselines to compare with, protocols (benchmarks) and reports."""
 
 import lazy_loader
 

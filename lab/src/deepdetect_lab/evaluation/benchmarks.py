@@ -1,7 +1,7 @@
 """Run benchmarks by name and collect one report.
 
-To add a benchmark, write a function that takes a run and options and returns sections, and add it
-to `BENCHMARKS`.
+To add a benchmark, write a function in a module of `protocols`, and add both names to `BENCHMARKS`.
+The function takes a `Run` and `BenchmarkOptions`, and returns the sections of the report.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "foreground": ("paper", "foreground"),
     "low-visibility": ("planar", "low_visibility"),
 }
-"""Benchmarks by name: a module of `protocols`, which is imported when it runs, and its function."""
+"""The module of `protocols` and the name of its function for each benchmark. The module is only
+imported when the benchmark runs."""
 
 
 def run_benchmarks(
@@ -42,11 +43,11 @@ def run_benchmarks(
     cache: str | Path | None = None,
     quiet: bool = True,
 ) -> Report:
-    """Run benchmarks of `BENCHMARKS` and collect their report.
+    """Run the named benchmarks of `BENCHMARKS` and return one report.
 
-    The data folder has a subfolder for each data set, or is the folder of the only data set.
-    Without a cache folder no results are kept. If a data set is missing, only the benchmarks that
-    use it fail.
+    The data folder has a subfolder for each data set, or it is itself the folder of the only data
+    set. If a data set is missing, only its benchmark fails; with a single benchmark, an ImageError
+    is raised. Without a cache folder no results are kept for later runs.
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
@@ -76,7 +77,7 @@ def run_benchmarks(
 
 
 def _weights(names: Sequence[str], options: BenchmarkOptions) -> dict[str, str]:
-    """Return the evaluated weights by name, with the beginning of their SHA-256."""
+    """Return metadata of a report: file names of the weights, with the start of their SHA-256."""
     files = {}
     if set(names) != {"middlebury"}:
         files["weights (SHA-256)"] = [options.detector.weights]

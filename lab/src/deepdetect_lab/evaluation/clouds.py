@@ -14,14 +14,15 @@ from deepdetect.geometry.point_cloud import PointCloud, robust_box
 from deepdetect.viz.draw import add_caption, join_pictures
 
 DPI = 100
-"""Pixels per inch, because matplotlib takes sizes in inches."""
+"""Pixels per inch of the figure. It is needed because matplotlib takes sizes in inches."""
 
 POINT_AREA = 1.5
-"""Area of a drawn point, in units of (1/72 inch)^2. It is 1.7 pixels wide, so that a surface with
-one point per image pixel has no gaps in side views."""
+"""Area of a drawn point in matplotlib's unit, (1/72 inch)^2. The point is 1.7 pixels wide, so that
+a surface with one point per image pixel has no gaps when it is seen from the side."""
 
 ZOOM = 2.2
-"""Zoom of the plot. At 1 the robust box of a cloud fills less than half of the figure's width."""
+"""Zoom of the plot, because at 1 the box around a cloud without its outliers would fill less than
+half of the figure's width."""
 
 
 def draw_cloud(
@@ -31,10 +32,11 @@ def draw_cloud(
     size: tuple[int, int] = (800, 600),
     like: PointCloud | None = None,
 ) -> np.ndarray:
-    """Draw a cloud on a white image, (H, W, 3) uint8. Near points hide far ones.
+    """Draw a point cloud on white; return an (H, W, 3) uint8 image. Near points hide far ones.
 
-    The camera is moved to the right by the azimuth and up by the elevation, in degrees. The robust
-    box of the cloud, or of the cloud `like`, fills the image.
+    The viewpoint is that of the camera, moved around the cloud to the right by the azimuth and up
+    by the elevation, in degrees. The image shows the box around the cloud without its outliers. If
+    another cloud is given as `like`, the image shows that cloud's box instead.
     """
     figure = Figure((size[0] / DPI, size[1] / DPI), DPI)
     canvas: Any = FigureCanvasAgg(figure)
@@ -56,9 +58,9 @@ def draw_cloud(
 
 
 def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
-    """Draw the left image and clouds by title in a grid of two columns.
+    """Draw the left image and each cloud with its title in a grid of two columns.
 
-    All clouds are drawn from the same viewpoint, which fits the cloud with the most points.
+    All clouds are drawn from the same viewpoint and with the frame of the cloud with most points.
     """
     size = (width, max(1, round(width * left.shape[0] / left.shape[1])))
     shrinks = left.shape[1] > width

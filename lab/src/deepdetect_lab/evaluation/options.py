@@ -1,4 +1,4 @@
-"""Options of benchmarks, and the local features that they compare."""
+"""Options of the benchmarks, and lists of the local features that each protocol compares."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ from .baselines.random import all_pixels_feature, random_feature
 
 PROTOCOLS = ("paper", "standard", "guided", "degraded")
 DEFAULT_PROTOCOLS = PROTOCOLS[:3]
-"""The default protocols do not include "degraded", because it measures everything five times."""
+"""The default protocols do not include "degraded", because it takes long: it measures all features
+again for each of four degradations of the images."""
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
 
 BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
-"""Classical baselines by name, from the paper and the standard protocol."""
+"""All classical baselines by name: those of the paper, and those of the standard protocol alone."""
 
 
 @suggest_keywords
@@ -43,16 +44,19 @@ class BenchmarkOptions:
 
     Attributes:
         detector: DeepDetect with the weights to evaluate.
-        protocols: names of protocols from `PROTOCOLS`.
-        classical: names of the classical baselines.
-        others: further local features.
-        channels: order of the colour channels in the paper's protocol; the paper's code uses "bgr".
-        geometry_weights: one or more weights for stereo pairs.
-        max_pairs: largest number of pairs per scene, evenly spaced (1: the last pair).
-        max_images: largest number of images per scene: the first images of a sequence, otherwise
-            evenly spaced images.
-        ranker: npz file of `deepdetect dev train-points` that ranks the keypoints. None: the
-            bundled file.
+        protocols: names from `PROTOCOLS`: the sets of measurements to make on image pairs with
+            homographies.
+        classical: names from `BASELINES`: the classical detectors to compare with.
+        others: further local features to compare with, for example external ones.
+        channels: order of the colour channels in which DeepDetect gets images; the paper's code
+            uses "bgr".
+        geometry_weights: names or files of weights, of which each is evaluated on stereo pairs.
+        max_pairs: largest number of image pairs per scene. If a scene has more, evenly spaced ones
+            are taken. 1 takes the last pair of a scene with homographies.
+        max_images: largest number of images per scene in structure from motion. If a scene has
+            more, the first images of a sequence or evenly spaced other images are taken.
+        ranker: npz file written by `deepdetect dev train-points`, with the network that ranks
+            multi-scale keypoints. None: the bundled file.
 
     Raises:
         OptionError: a name is unknown, or a number is out of its range.
@@ -81,7 +85,7 @@ class BenchmarkOptions:
             )
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
-        """Return DeepDetect as in the paper: 480x480 images, SIFT of size 3."""
+        """Return DeepDetect as in the paper: images resized to 480x480, SIFT of size 3 px."""
         return deepdetect_feature(
             self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)),
             SelectionOptions(threshold),
@@ -94,31 +98,31 @@ class BenchmarkOptions:
         return self.detector.configured(HeatmapOptions("native", self.channels))
 
     def deepdetect_native(self) -> LocalFeature:
-        """Return DeepDetect at native image resolution, with all pixels over 0.5 as keypoints."""
+        """Return DeepDetect at native resolution. Pixels with probability > 0.5 are keypoints."""
         title = "DeepDetect, native resolution, all pixels over 0.5"
         return deepdetect_feature(self.native_detector(), name="deepdetect-native", title=title)
 
     def chance_baselines(self) -> tuple[LocalFeature, LocalFeature]:
-        """Return two baselines: as many random points as `deepdetect_480` finds, and all pixels."""
+        """Return two baselines: as many random pixels as `deepdetect_480` marks, and all pixels."""
         return random_feature(self.deepdetect_480()), all_pixels_feature()
 
     def density_features(self) -> list[LocalFeature]:
-        """Return the rows of Table I and of the repeatability, chance baselines last."""
+        """Return the features to compare by density (Table I of the paper) and by repeatability."""
         classical = [CLASSICAL[name] for name in self.classical if name in CLASSICAL]
         own = [self.deepdetect_480(threshold) for threshold in THRESHOLDS]
         return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
 
     def matching_features(self) -> list[LocalFeature]:
-        """Return the rows of Table II: detectors with low settings, DeepDetect, chance."""
+        """Return the features of the paper's Table II, low-setting detectors and DeepDetect."""
         low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
         own = [self.deepdetect_480(), *self.chance_baselines()]
         return without_repeats([*low, *self.others, *own])
 
     def standard_features(self) -> list[LocalFeature]:
-        """Return the rows of the standard protocol: default settings, sparse DeepDetect, chance."""
+        """Return the features of the standard protocol, chance baselines last."""
         ranked = {**STANDARD, **HESSIAN}
         chosen = [name for name in ranked if name in self.classical]
-        # Features with their own descriptors get a second row that uses them.
+        # These features are measured twice: with the common descriptor, and with their own.
         systems = {f.name: f for f in self.others if f.name in BASELINES}
         systems |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
         own = deepdetect_feature(
@@ -144,7 +148,7 @@ class BenchmarkOptions:
 
 
 def without_repeats(features: Sequence[LocalFeature]) -> list[LocalFeature]:
-    """Remove repeated features; raise an OptionError if two different features share a name."""
+    """Drop repetitions of a feature; raise an OptionError if different features share a name."""
     by_name: dict[str, LocalFeature] = {}
     for feature in features:
         if by_name.setdefault(feature.name, feature).version != feature.version:

@@ -1,4 +1,4 @@
-"""Measure time and memory of a piece of work."""
+"""Measure the time and the memory that a block of code or a function needs."""
 
 from __future__ import annotations
 
@@ -18,22 +18,24 @@ Outcome = TypeVar("Outcome")
 
 @dataclass
 class Profile:
-    """Wall time of some work, and the largest growth of the process's memory in bytes."""
+    """Wall time of a `profiled` block in seconds, and the growth of memory to its peak in bytes."""
 
     seconds: float = 0.0
     memory: float = 0.0
 
 
 _highest = 0
-"""Highest peak memory in bytes before the operating system's counter was last reset."""
+"""Peak memory of the process, in bytes, up to the last reset of the operating system's counter of
+peak memory. `profiled` resets the counter."""
 
 
 @contextmanager
 def profiled() -> Iterator[Profile]:
-    """Measure the time and memory growth of a block. The values are set after the block.
+    """Measure time and memory growth of a `with` block. Read the `Profile` after the block.
 
-    On Linux the memory is exact, because the peak is reset when the block begins. On other systems
-    only a new highest peak of the process is noticed. Two blocks must not run at the same time.
+    On Linux the memory is exact, because the counter of peak memory is reset when the block begins.
+    Other systems cannot reset it, so growth is only measured if the block needs more memory than
+    the process ever had. Two blocks must not run at the same time.
     """
     global _highest
     _highest = peak_memory()
@@ -51,8 +53,8 @@ def peak_memory() -> int:
 
 
 def _memory(name: str) -> int:
-    """Return a memory value of /proc/self/status in bytes, or the peak memory on other systems."""
-    # Linux's ru_maxrss includes the memory of the parent process; /proc/self/status is exact.
+    """Return a value of Linux's /proc/self/status in bytes; on other systems, the peak memory."""
+    # On Linux ru_maxrss includes memory of the parent process. /proc/self/status does not.
     with suppress(OSError), open("/proc/self/status", encoding="ascii") as status:
         return next(int(line.split()[1]) * 1024 for line in status if line.startswith(f"{name}:"))
     try:
@@ -66,8 +68,8 @@ def _memory(name: str) -> int:
 def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
     """Call a module-level function in a new process, so that `peak_memory` measures only its work.
 
-    OpenCV and our kernels use one thread in that process. Errors of the function are raised here. A
-    DeepDetectError is raised if the process is killed.
+    In that process OpenCV and this package's kernels use one thread. If the function raises an
+    error, it is raised again here. If the process is killed, a DeepDetectError is raised.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor

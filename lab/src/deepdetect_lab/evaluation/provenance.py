@@ -1,4 +1,4 @@
-"""Provenance of weights and reports: command, versions, commit, machine."""
+"""Record how weights and reports were made: command, commit, machine and package versions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES)
 
 
 def provenance() -> dict[str, str]:
-    """Return the command, versions and machine by name, for weights files and reports."""
+    """Return command, commit, machine and versions as texts, to store in weights and reports."""
     program, *arguments = sys.argv or [""]
     name = Path(program).name
     command = ["deepdetect" if name == "__main__.py" else name, *arguments]
@@ -39,7 +39,7 @@ def _versions() -> list[str]:
 
 
 def _commit() -> str:
-    """Return the git commit of the sources, with "+" if files are modified; "" if unknown."""
+    """Return the git commit of this code, with "+" if source files were modified; "" if unknown."""
 
     def git(*words: str) -> str:
         command = ["git", "-C", str(Path(__file__).resolve().parent), *words]
@@ -47,7 +47,8 @@ def _commit() -> str:
         return done.stdout.strip()
 
     try:
-        # An installed package may be inside the repository of another project.
+        # This fails unless git tracks this file: the package may be installed in a folder that
+        # belongs to the repository of another project.
         git("ls-files", "--error-unmatch", __file__)
         changed = git("status", "--porcelain", "--", ":/src", ":/lab/src")
         return git("rev-parse", "HEAD") + ("+" if changed else "")

@@ -20,18 +20,18 @@ Cell = str | int | float | None
 """The value of a table's cell; None is shown as a dash."""
 
 Row = dict[Any, Any]
-"""The values of one measurement by name."""
+"""The values of one measurement, keyed by their names."""
 
 Rows = list[Row]
 
 
 def where(rows: Iterable[Row], **wanted: Any) -> Rows:
-    """Return the rows that have the wanted values."""
+    """Return the rows that have all the wanted values, given as name=value."""
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 
 def mean(rows: Iterable[Row], name: Any) -> float | None:
-    """Return the mean of the rows' values of this name without NaN; None if no value is left."""
+    """Return the mean of the rows' values `name`, without None and NaN; None if none is left."""
     return mean_of(row[name] for row in rows)
 
 
@@ -43,10 +43,10 @@ def mean_of(values: Iterable[float | None]) -> float | None:
 
 @dataclass(frozen=True)
 class Table:
-    """A table whose key, for example "oxford_matches", is the name of its file.
+    """A table of a report. Its `key`, for example "oxford_matches", names its file.
 
-    `columns` holds the number format of each column, such as ",d", by title. Rows hold cells by
-    column title. A cell that is missing, None or NaN is shown as a dash.
+    `columns` maps each column's title to its number format, for example ",d", or "" for text. Each
+    row maps column titles to cells. A cell that is missing, None or NaN is shown as a dash.
     """
 
     key: str
@@ -56,7 +56,7 @@ class Table:
     note: str = ""
 
     def values(self) -> list[dict[str, Cell]]:
-        """Return the rows in the order of the columns; NaN becomes None, since JSON has no NaN."""
+        """Return the rows with cells in column order. NaN and inf become None: JSON has neither."""
         return [
             {
                 title: None if isinstance(cell, float) and not math.isfinite(cell) else cell
@@ -67,7 +67,7 @@ class Table:
         ]
 
     def to_markdown(self) -> str:
-        """Write the table in Markdown, with names aligned left and numbers aligned right."""
+        """Return the table as Markdown, with text aligned left and numbers aligned right."""
 
         def line(cells: Iterable[str]) -> str:
             return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
@@ -79,7 +79,7 @@ class Table:
         return "\n".join([line(self.columns), rule, *map(line, rows)])
 
     def to_csv(self) -> str:
-        """Write the table as CSV with all digits; unknown values are empty cells."""
+        """Return the table as CSV with unrounded numbers. Missing cells, None and NaN are empty."""
         text = io.StringIO(newline="")
         writer = csv.writer(text)
         writer.writerow(self.columns)
@@ -90,26 +90,26 @@ class Table:
 
 
 def _shown(cell: Cell, style: str) -> str:
-    """Write a cell as text; None and NaN become a dash."""
+    """Return the text of a cell; None and NaN become a dash."""
     if cell is None or cell != cell:
         return "–"
     return cell if isinstance(cell, str) else format(cell, style)
 
 
 Measure = Callable[[Rows], Cell]
-"""A function from the rows of one method to the value of a cell."""
+"""A function that computes the value of a table cell from all rows of one method."""
 
 Columns = Mapping[str, tuple[str, Measure]]
-"""Number format and `Measure` of each column, by its title."""
+"""The number format and the `Measure` of each column, keyed by the column's title."""
 
 
 def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
-    """Make a column with the mean of a value over the rows that have the wanted values."""
+    """Make a column: the mean of the value `name` over the rows that have the `wanted` values."""
     return style, lambda rows: mean(where(rows, **wanted), name)
 
 
 def median(style: str, name: Any) -> tuple[str, Measure]:
-    """Make a column with the median of a value over the rows where it is not None."""
+    """Make a column: the median of the value `name` over the rows where it is not None."""
 
     def of_known(rows: Rows) -> Cell:
         known = [row[name] for row in rows if row[name] is not None]
@@ -127,10 +127,10 @@ def tabulate(
     note: str = "",
     groups: Sequence[Row] = ({},),
 ) -> Table:
-    """Make a table from the rows of `Run.rows`, with a line for each method.
+    """Make a table from the rows of `Run.rows`, with one line for each method.
 
-    With groups, each combination of their values has its own lines. The groups are the first
-    columns.
+    Each of the `groups`, for example {"scene": "graf"}, gets its own lines, computed from the rows
+    that have its values. The first columns show these values.
     """
     lines = []
     for group in groups:
@@ -145,7 +145,7 @@ def tabulate(
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure: name of its file, caption, and the bytes of the PNG file."""
+    """A figure: `key` names its file, `title` is its caption, `png` is the content of the file."""
 
     key: str
     title: str
@@ -154,7 +154,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report: a heading, paragraphs, tables, then figures."""
+    """A section of a report: a heading, then paragraphs (`text`), then tables, then figures."""
 
     title: str
     text: tuple[str, ...] = ()
@@ -166,8 +166,9 @@ class Section:
 class Report:
     """The report of a benchmark.
 
-    `metadata` describes the run. `skipped` lists what was not measured, with reasons. `failures`
-    lists the requested measurements that failed.
+    `metadata` describes how the report was made (command, versions, times). `skipped` lists
+    everything that was not measured, with reasons. `failures` lists only the requested measurements
+    that failed.
     """
 
     title: str
@@ -181,7 +182,7 @@ class Report:
         return [table for section in self.sections for table in section.tables]
 
     def values(self) -> dict[str, Any]:
-        """Return the report as plain values. Each row is a dict by column title."""
+        """Return the report as values for a JSON file. Table rows are dicts by column title."""
         return {
             "title": self.title,
             "metadata": self.metadata,
@@ -193,7 +194,7 @@ class Report:
         }
 
     def save(self, folder: Path) -> list[Path]:
-        """Write report.md, figures/KEY.png, tables/KEY.csv and report.json; return the files."""
+        """Write report.md, figures/KEY.png, tables/KEY.csv and report.json; return their paths."""
         files = {"report.md": self._markdown().encode()}
         files |= {f"figures/{f.key}.png": f.png for s in self.sections for f in s.figures}
         files |= {f"tables/{table.key}.csv": table.to_csv().encode() for table in self.tables()}
@@ -219,11 +220,12 @@ MARKERS = ("o", "s", "^", "x")
 DASHES = ("-", "--", ":", "-.")
 
 WIDEST = 1600
-"""Wider images are shrunk to this width in pixels. Chosen by hand; not measured."""
+"""Images that are wider than this are shrunk to this width in pixels for a report. Chosen by hand;
+not measured."""
 
 
 def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
-    """Draw horizontal bars by name, each with its value. Highlighted bars have another colour."""
+    """Draw a horizontal bar for each name, as PNG. `highlighted` bars have another colour."""
     figure = _figure(8, 0.32 * len(values) + 1)
     axes = figure.subplots()
     colors = ["C1" if name in highlighted else "C0" for name in values]
@@ -242,14 +244,14 @@ def line_chart(
     x_label: str,
     y_label: str,
 ) -> bytes:
-    """Draw lines of (x, y) values with a legend. A line of one value is drawn as a point."""
+    """Draw a line through the (x, y) points of each name, with a legend, as PNG."""
     figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
     for k, (name, (x, y)) in enumerate(lines.items()):
-        # Colours repeat after ten lines. Then markers and dashes change.
+        # There are ten colours, so each ten lines get another marker and another dash pattern.
         marker, dash = MARKERS[k // 10 % len(MARKERS)], DASHES[k // 10 % len(DASHES)]
         axes.plot(x, y, label=name, color=f"C{k % 10}", marker=marker, linestyle=dash)
     if lines:
@@ -258,7 +260,7 @@ def line_chart(
 
 
 def picture(rgb: np.ndarray) -> bytes:
-    """Encode an (H, W, 3) uint8 RGB image as PNG. Images wider than `WIDEST` are shrunk."""
+    """Encode an (H, W, 3) uint8 RGB image as PNG, shrunk if it is wider than `WIDEST`."""
     if rgb.shape[1] > WIDEST:
         size = (WIDEST, round(rgb.shape[0] * WIDEST / rgb.shape[1]))
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""A run of benchmarks: its data, cached results of stages, and failed measurements."""
+"""A run of benchmarks: it finds data, caches results of stages, and records failures."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "pose": (9, ("matches", "guided")),
     "sfm": (4, ()),
 }
-"""Version of each cached stage, and the stages whose results it uses.
+"""Version of each stage of computation whose results are cached, and the stages that it builds on.
 
-Increase the version whenever a change of the code changes the results of a stage. Otherwise old
-cached results of this stage and of the stages that use it would be read.
+Increase a stage's version whenever a change of the code changes its results. Otherwise outdated
+results of this stage, and of the stages that build on it, would be read from the cache.
 """
 
 RECENT_IMAGES = 8
@@ -55,10 +55,11 @@ class CacheError(DeepDetectError):
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """How the descriptors of a pair are matched.
+    """How the descriptors of two images are matched.
 
-    `matcher` applies to Euclidean distances; binary descriptors are matched exactly by Hamming
-    distance. Only the best `budget` keypoints of each image are matched.
+    `matcher` is used for descriptors with Euclidean distance. Binary descriptors are always matched
+    exactly by Hamming distance. If there is a `budget`, only this number of best keypoints of each
+    image is matched.
     """
 
     matcher: str = "flann"
@@ -70,9 +71,10 @@ class MatchSettings:
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """The (M, 2) matched positions of a pair, and the positions of all keypoints used.
+    """The M matches of two images: `points0[i]` matches `points1[i]`, (M, 2) positions each.
 
-    `seconds` is the time that description and matching took when they were computed.
+    `keypoints0` and `keypoints1` are the positions of all keypoints that were to be matched.
+    `seconds` is the time for describing and matching, measured when they were not yet cached.
     """
 
     points0: np.ndarray
@@ -86,13 +88,13 @@ class Run:
     """A run of benchmarks.
 
     Args:
-        data: folder of the data sets, or folder of the only data set needed.
-        cache: folder for the results of stages. Each file is named by a digest of all inputs.
-            Damaged files are computed again. Old files are never removed. None: no cache.
+        data: folder with a subfolder for each data set, or the folder of the only data set needed.
+        cache: folder for the results of stages. A file's name is a digest of all inputs of its
+            result. Damaged files are computed again. Old files are never removed. None: no cache.
         quiet: show no progress bars.
 
     Attributes:
-        made: number of results that were computed, not read from the cache.
+        made: number of results that were computed instead of being read from the cache.
         skipped, failures: as in `Report`.
     """
 
@@ -111,7 +113,7 @@ class Run:
 
     @cached_property
     def files_folder(self) -> Path:
-        """Folder for generated images: the cache, or a temporary folder."""
+        """Folder for generated images: the cache folder, or without one a temporary folder."""
         if self.cache is not None:
             return self.cache
         folder = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
@@ -119,10 +121,11 @@ class Run:
         return folder
 
     def attempt(self, name: str, work: Callable[..., Result], *arguments: Any) -> Result | None:
-        """Run some work; if it fails, record the reason and return None.
+        """Return what `work` returns for these arguments; if it fails, record why and return None.
 
-        Only errors of data and of external detectors are recorded. All others are raised as bugs.
-        This includes errors of options, because the user's options were checked before the run.
+        Errors of data, of external detectors and of OpenCV are recorded. All other errors are
+        raised, because the cache is unusable or there is a bug. An OptionError is a bug here, since
+        the user's options were checked before the run.
         """
         try:
             return work(*arguments)
@@ -134,7 +137,7 @@ class Run:
             return None
 
     def fail(self, reason: str) -> None:
-        """Record a requested measurement that failed."""
+        """Record that a requested measurement has failed, with the reason."""
         self.skipped.append(reason)
         self.failures.append(reason)
 
@@ -145,10 +148,12 @@ class Run:
         items: Mapping[str, Any],
         measure: Callable[[Any, Any], Row],
     ) -> Rows:
-        """Measure each method on each item. Items are given by name.
+        """Measure each method on each item, for example an image pair; return a row for each.
 
-        Methods have a name and may have a title. `what` begins the texts of the progress bar and of
-        failures. Rows hold the names as "method" and "item". Failed measurements have no row.
+        `items` is keyed by name. A method is any object with a name, and possibly a title. A row
+        has the names as "method" and "item", and the values that `measure(method, item)` returns.
+        Measurements that fail are recorded and have no row. `what`, for example "matches of ",
+        precedes the method in the texts of the progress bar and of failures.
         """
         rows: Rows = []
         with progress(len(methods) * len(items), "benchmark", "task", self.quiet) as bar:
@@ -163,10 +168,10 @@ class Run:
         return rows
 
     def cached(self, stage: str, depends: object, make: Callable[[], Row]) -> Row:
-        """Read a result of one of `STAGES` from the cache, or compute it and keep it.
+        """Read a result of one of `STAGES` from the cache, or else compute and cache it.
 
-        A result holds arrays, numbers and texts. The values of `depends` identify the result. The
-        content of its file identifies a path.
+        A result maps names to arrays, numbers or texts. `depends` holds all inputs of the result,
+        which identify it in the cache. A path among them stands for the content of its file.
         """
         path = None
         kept: Mapping[str, np.ndarray] | None = None
@@ -184,7 +189,10 @@ class Run:
         return {name: value if value.ndim else value.item() for name, value in kept.items()}
 
     def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, float]:
-        """Return the keypoints of an image and the seconds of detection, cached if possible."""
+        """Return the keypoints of an image and the seconds that detection took.
+
+        They are read from the cache if they are there.
+        """
         name = f"{feature.detection} {file_digest(image)}"
         if name not in self._recent:
             self._recent[name] = self._keypoints(feature, image)
@@ -209,7 +217,7 @@ class Run:
     def matches(
         self, feature: LocalFeature, images: tuple[Path, Path], settings: MatchSettings
     ) -> PairMatches:
-        """Return the matches of two images, from the cache if possible."""
+        """Return the matches of two images, from the cache if they are there."""
         both = [self.keypoints(feature, image)[0] for image in images]
         if settings.budget is not None:
             both = [keypoints.best(settings.budget) for keypoints in both]
@@ -238,13 +246,13 @@ class Run:
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
     ) -> tuple[list[np.ndarray], float]:
-        """Describe the keypoints of both images; return the descriptors and the seconds.
+        """Return the descriptors of both images' keypoints, and the seconds for computing them.
 
-        The descriptors of the last pair are kept for other match settings.
+        The descriptors of the last pair stay in memory, to be matched again with other settings.
         """
         name = key(*feature.key, images, [len(keypoints) for keypoints in both])
         if self._described is None or self._described[0] != name:
-            self._described = None  # frees memory before new descriptors are computed
+            self._described = None  # frees the old descriptors before new ones are computed
             rgb = [load_image(image) for image in images]
             with profiled() as profile:
                 descriptors = [
@@ -256,7 +264,7 @@ class Run:
 
 
 def stage_versions(stage: str) -> dict[str, Any]:
-    """Return the versions of a stage, of the stages that it uses, and of the packages."""
+    """Return the versions of a stage, of all stages that it builds on, and of NumPy and OpenCV."""
     version, sources = STAGES[stage]
     versions = {"numpy": np.__version__, "opencv": cv2.__version__, stage: version}
     for source in sources:

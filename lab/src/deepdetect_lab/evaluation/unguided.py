@@ -1,4 +1,4 @@
-"""Matching by descriptors alone, as in the paper, with which guided matching is compared."""
+"""Match by descriptors alone, as in the paper. Benchmarks compare guided matching with this."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from deepdetect.matching import match_features
 from .baselines.method import PAPER_DESCRIPTOR, PointDescriptor
 
 PAPER_RATIO = 0.99
-"""The ratio test of the authors' published code keeps matches with a ratio under 0.99."""
+"""The paper's published code keeps a match if the ratio of the distances to the nearest and the
+second-nearest descriptor is under 0.99."""
 
 UPRIGHT_SIFT = PointDescriptor(angle_deg=0.0)
-"""SIFT descriptor of the paper's size, but with angle 0. The paper sets the angle -1 for "unset",
-but OpenCV takes it as -1 degree."""
+"""SIFT descriptor of the paper's size, but with angle 0. The paper's code leaves the angle at -1,
+which means "unset" in OpenCV, but OpenCV's SIFT takes it as an angle of -1 degree."""
 
 
 def match_unguided(
@@ -34,13 +35,14 @@ def match_unguided(
     mutual: bool = False,
     seed: int = 0,
 ) -> Matches:
-    """Match the keypoints of two images by their descriptors, without geometry.
+    """Match the keypoints of two images by their descriptors alone, without any geometry.
 
     Args:
         image0, image1: images in any form that `load_image` accepts.
         detector: object with a method `heatmap` or `detect`.
-        selection: which pixels of a heat map become keypoints. None: all pixels over 0.5.
-        descriptor: descriptor of the keypoints.
+        selection: which pixels of a heat map become keypoints. None: all with a probability over
+            0.5.
+        descriptor: type, size and angle of the descriptors.
         matcher, ratio, mutual, seed: as in `match_features`.
     """
     start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Evaluate weights by known masks, by labels at several scales, and by the paper's protocol."""
+"""Evaluate weights by known masks, by labels of scaled images, and by the paper's protocol."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class OxfordScore:
     """Scores of weights on the Oxford scenes, with RGB images resized to 480x480.
 
     Attributes:
-        density: keypoints per pixel at each of the paper's thresholds, mean over all images. With
-            equal density there is only the first threshold.
-        repeatability: the paper's clipped repeatability by scene, mean over its five pairs.
-        correct: number of correct matches by pair (FLANN, ratio 0.99, error under 1 px by the
-            published homography), mean over several seeds of FLANN.
-        matches: number of all matches that pass the ratio test, by pair, mean over the seeds.
-        failures: a sentence for each image or pair that failed. The means do not include these.
+        density: for each of the paper's thresholds, the number of keypoints per pixel, mean over
+            all images. With `equal_density` only the first threshold is a key.
+        repeatability: the paper's repeatability of each scene, mean over its five pairs.
+        correct: for each pair, the number of matches (FLANN, ratio 0.99) with an error under 1 px
+            by the published homography, mean over several seeds of FLANN.
+        matches: for each pair, the number of all matches, mean over the same seeds.
+        failures: a sentence for each image or pair that failed. The means leave these out.
     """
 
     density: dict[float, float]
@@ -57,13 +57,14 @@ class OxfordScore:
 
 @dataclass(frozen=True)
 class ForegroundScore:
-    """How many keypoints are on the foreground of photographs resized to 480x480.
+    """How many keypoints are on the foreground of photographs, which are resized to 480x480.
 
     Attributes:
-        fraction: fraction of the keypoints on the foreground, mean over the photographs.
+        fraction: fraction of the keypoints that are on the foreground, mean over the photographs.
         density: keypoints per pixel, mean over the photographs.
-        covered: fraction of the pixels on the foreground, the score of random keypoints.
-        photographs: number of photographs with a keypoint, which are measured.
+        covered: fraction of the pixels that are on the foreground, mean over the photographs.
+            Random keypoints would get this as their `fraction`.
+        photographs: number of photographs with a keypoint. The means leave out the others.
         failures: a sentence for each photograph that could not be measured.
     """
 
@@ -76,15 +77,16 @@ class ForegroundScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of weights.
+    """Scores of weights, as returned by `evaluate`.
 
     Attributes:
-        masks: agreement with the known masks of samples, by visibility ("normal" or "low").
-        scales: agreement with the labels of scaled images, by scale and visibility.
-        oxford: scores by the paper's protocol.
+        masks: agreement of heat maps with known masks, by visibility ("normal" or "low").
+        scales: agreement of the heat maps of scaled images with labels made from these images, by
+            (scale, visibility).
+        oxford: scores by the paper's protocol on the Oxford scenes.
         foreground: scores on photographs with a known foreground.
-        failures: a sentence for each sample that cannot be read and is not in the scores. `oxford`
-            and `foreground` have their own failures.
+        failures: a sentence for each sample that `masks` and `scales` leave out, because it cannot
+            be used. `oxford` and `foreground` have their own failures.
     """
 
     masks: dict[str, MaskScore] = field(default_factory=dict)
@@ -105,25 +107,29 @@ def evaluate(
     equal_density: bool = False,
     quiet: bool = True,
 ) -> Evaluation:
-    """Evaluate weights.
+    """Evaluate weights of DeepDetect by each kind of data that is given.
 
     Args:
-        detector: DeepDetect with the weights; default `DeepDetect()`. Known masks are compared at
-            the detector's own resolution, everything else at the resolution of the protocol.
-        samples: folder of images `image_NAME.png` with known masks `mask_image_NAME.png`; with
-            `scales` any images, without masks.
-        scales: factors above 0; samples scaled by each factor are compared with their own labels.
+        detector: DeepDetect with the weights; default `DeepDetect()`. For known masks it keeps its
+            own resolution. Scaled images are processed at their size, and images of `oxford` and
+            `foreground` are resized to 480x480.
+        samples: folder of images `image_NAME.png` with known masks `mask_image_NAME.png`. If
+            `scales` are given, it may also be a folder of any images without masks.
+        scales: factors above 0, by which the images in `samples` are scaled. Heat maps of scaled
+            images are compared with labels that are computed from the scaled images.
         oxford: folder of the eight Oxford scenes, for which repeatability and matches are measured.
         foreground: folder of photographs NAME.jpg with their foreground NAME_mask.png, for which
             the fraction of the keypoints on the foreground is measured.
-        equal_density: in images of `oxford` and `foreground`, take the most probable keypoints, as
-            many as the image's label marks, instead of all above the threshold 0.5. This makes
-            weights comparable, since any larger set of keypoints repeats and matches more often.
+        equal_density: in each image of `oxford` and `foreground`, take as many keypoints as the
+            fusion label of the image marks pixels: the most probable ones, instead of all above the
+            threshold 0.5. This makes weights comparable, since larger sets of keypoints always
+            repeat and match more often.
         quiet: show no progress bars.
 
     Raises:
         ImageError: no sample, scene or photograph can be read, or a file of one is missing.
-        OptionError: a scale is not above 0, or `scales` or `equal_density` has no images.
+        OptionError: a scale is not above 0, `scales` is given without `samples`, or `equal_density`
+            without `oxford` or `foreground`.
 
     Example:
         >>> import tempfile
@@ -138,10 +144,10 @@ def evaluate(
     if not all(0 < scale < math.inf for scale in scales):
         raise OptionError(f"scales must be numbers above 0, not {list(scales)}")
     if scales and samples is None:
-        raise OptionError("scales apply to the images in samples: also name their folder")
+        raise OptionError("`scales` needs images to scale: also name their folder as `samples`")
     if equal_density and oxford is None and foreground is None:
         raise OptionError(
-            "`equal_density` needs keypoints: also name a folder as `oxford` or `foreground`"
+            "`equal_density` only affects `oxford` and `foreground`: also name one of these folders"
         )
     scenes = None if oxford is None else load_oxford(oxford)
     masked = None if foreground is None else load_foreground(foreground)
@@ -185,10 +191,10 @@ def evaluate(
 def evaluate_oxford(
     detector: Any, scenes: list[PlanarScene], *, equal_density: bool = False, quiet: bool = True
 ) -> OxfordScore:
-    """Evaluate weights, or anything with a method `heatmap`, on scenes of `load_oxford`.
+    """Evaluate weights, or any detector with a method `heatmap`, on scenes from `load_oxford`.
 
-    A DeepDetect gets images resized to 480x480, whatever its own resolution. Its other options
-    stay. With `equal_density` it takes as many keypoints per image as the label marks.
+    A DeepDetect gets images resized to 480x480, whatever its own resolution. If `equal_density`, it
+    takes as many keypoints in each image as the image's fusion label marks pixels.
     """
     detector = _of_paper(detector, equal_density)
     features = [_feature(detector)]
@@ -229,20 +235,23 @@ def evaluate_foreground(
     equal_density: bool = False,
     quiet: bool = True,
 ) -> ForegroundScore:
-    """Measure the fraction of keypoints on the foreground, as `evaluate_oxford` does."""
+    """Measure the fraction of keypoints on the foreground. Options are as in `evaluate_oxford`."""
     run = Run(Path(), quiet=quiet)
     rows = foreground_rows(run, [_feature(_of_paper(detector, equal_density))], images)
     known = [row for row in rows if row["density"] > 0]
     if run.failures and not rows:
         raise ImageError(run.failures[0])
     if not known:
-        raise ImageError("no photograph with a foreground has a keypoint")
+        raise ImageError("the detector finds no keypoint in any photograph with a foreground mask")
     fraction, density, covered = (mean(known, n) or 0.0 for n in ("fraction", "density", "covered"))
     return ForegroundScore(fraction, density, covered, len(known), tuple(run.failures))
 
 
 def _of_paper(detector: Any, equal_density: bool) -> Any:
-    """Return a DeepDetect that resizes images as in the paper; other detectors are unchanged."""
+    """Return a copy of a DeepDetect that resizes images to 480x480, as in the paper.
+
+    Detectors of other types are returned unchanged.
+    """
     if not isinstance(detector, DeepDetect):
         return detector
     options = replace(

@@ -1,1 +1,1 @@
-"""Detectors and descriptors as baselines: classical ones, external ones, and chance."""
+"""Baselines to compare with: classical and external detectors and descriptors, and chance."""

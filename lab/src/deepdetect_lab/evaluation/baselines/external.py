@@ -1,16 +1,21 @@
 """Find detectors by name: a classical detector, an ONNX file, or an importable function.
 
 A function is named as "package.module:function". It takes an (H, W, 3) uint8 RGB image and returns
-a dict with `keypoints` (N, 2), `scores` (N,) and optionally `descriptors` (N, D). It may have these
-attributes: `learned` (its descriptors need no ratio test), `binary` (they are compared by Hamming
-distance) and `version`. Change `version` whenever the results change, because the cache only
-notices changes in the module's own file.
+a dict with `keypoints` (N, 2), `scores` (N,) and optionally `descriptors` (N, D). The function may
+have these attributes: `learned` (its descriptors need no ratio test), `binary` (its descriptors are
+compared by Hamming distance) and `version`. Change `version` whenever the results change, because
+the cache of results only notices changes in the module's own file.
 
-An ONNX file has one input in [0, 1], 1x3xHxW RGB or 1x1xHxW grey (the mean of the channels). Its
-size is fixed or free. The outputs have the names of the dict, in pixels of the input, as in XFeat.
-A leading dimension of 1 is allowed. Alternatively the outputs are maps, as in EdgePoint2: `scores`,
-1x1xHxW logits whose maxima are the keypoints, and `descriptors`, 1xDxhxw. Images are resized to the
-fixed size, or for maps to sides that are multiples of 32. Keypoints are scaled back.
+An ONNX file has one input with values in [0, 1]: 1x3xHxW, an RGB image, or 1x1xHxW, the mean of the
+three channels. H and W may be fixed or free. There are two kinds of outputs:
+
+- lists, as in XFeat: the same `keypoints`, `scores` and `descriptors` as in the dict, where
+  positions are pixels of the input. They may have an additional leading dimension of 1.
+- maps, as in EdgePoint2: `scores`, 1x1xHxW logits whose local maxima become the keypoints, and
+  `descriptors`, 1xDxhxw, from which the descriptors of the keypoints are interpolated.
+
+If H and W are fixed, images are resized to them. If they are free and the outputs are maps, image
+sides are resized to multiples of 32. Keypoints are scaled back to the original image.
 """
 
 from __future__ import annotations
@@ -36,17 +41,17 @@ from .method import COMMON_DESCRIPTOR, BaselineError, LocalFeature
 from .opencv import CLASSICAL
 
 MAP_SIDE, MAP_BORDER_PX, MAP_LEAST_LOGIT, MAP_WINDOW = 32, 4, -5, np.ones((5, 5), np.uint8)
-"""Values of EdgePoint2, used for ONNX files with maps. In this order, they are the divisor of the
-sides in pixels, the smallest distance of keypoints from the border, the smallest logit of
-keypoints, and the window of non-maximum suppression."""
+"""Settings for ONNX files that output maps; the values are those of EdgePoint2. Image sides are
+resized to multiples of `MAP_SIDE` pixels. Keypoints are at least `MAP_BORDER_PX` from the border,
+have a logit over `MAP_LEAST_LOGIT`, and are the maximum of the window `MAP_WINDOW` around them."""
 
 
 def find_feature(word: str) -> LocalFeature:
-    """Find a local feature by its name, an ONNX file, or "package.module:function".
+    """Return the local feature for a baseline's name, an ONNX file, or "package.module:function".
 
     Raises:
-        OptionError: no local feature has this name.
-        WeightsError: the file cannot be used.
+        OptionError: no baseline has this name, or the function cannot be imported.
+        WeightsError: the ONNX file cannot be used.
     """
     if Path(word).suffix == ".onnx":
         return onnx_feature(word)
@@ -55,11 +60,11 @@ def find_feature(word: str) -> LocalFeature:
     try:
         return look_up("method", word, {**CLASSICAL, **HESSIAN})
     except OptionError as error:
-        raise OptionError(f"{error}; or give an ONNX file, or package.module:function") from None
+        raise OptionError(f"{error}; or give an ONNX file or package.module:function") from None
 
 
 def plugin_feature(target: str) -> LocalFeature:
-    """Make a local feature of a function in a module that is installed or in the current folder."""
+    """Make a local feature from an importable function. Its module may be in the current folder."""
     module, _, name = target.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)
@@ -67,7 +72,7 @@ def plugin_feature(target: str) -> LocalFeature:
         function = getattr(importlib.import_module(module), name)
     except Exception as error:  # the module's code may raise anything
         raise OptionError(
-            f"{target} cannot be imported ({first_line(error)}): name it as package.module:function"
+            f"{target} cannot be imported ({first_line(error)}): give package.module:function"
         ) from None
     finally:
         sys.path.remove(here)
@@ -83,10 +88,11 @@ def plugin_feature(target: str) -> LocalFeature:
 def onnx_feature(
     path: str | Path, backend: str = "onnxruntime", threads: int | None = None
 ) -> LocalFeature:
-    """Make a local feature of an ONNX file, which "onnxruntime" or "openvino" runs.
+    """Make a local feature from an ONNX file. The backend is "onnxruntime" or "openvino".
 
     Raises:
-        WeightsError: the file cannot be opened, or its inputs or outputs do not fit.
+        WeightsError: the file cannot be opened, or its inputs or outputs are not as described at
+            the top of this module.
     """
     file = Path(path)
     try:
@@ -96,18 +102,18 @@ def onnx_feature(
         raise WeightsError(f"{file} is not a usable ONNX file ({first_line(error)})") from None
     shapes = network.shapes
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] not in (1, 3):
-        raise WeightsError(f"{file} must have one input 1x3xHxW, RGB, or 1x1xHxW, not {shapes}")
+        raise WeightsError(f"{file} must have one input, 1x3xHxW or 1x1xHxW, not {shapes}")
     if "scores" not in network.outputs or not {"keypoints", "descriptors"} & {*network.outputs}:
         raise WeightsError(
-            f"{file} must have the outputs scores and keypoints, or maps scores and descriptors, "
-            f"not {network.outputs}"
+            f"{file} must have the outputs 'scores' and 'keypoints', or the maps 'scores' and "
+            f"'descriptors', not {network.outputs}"
         )
     learned = "descriptors" in network.outputs
     return _external_feature(file.stem, partial(_run_onnx, network), version, learned)
 
 
 class _Network(NamedTuple):
-    """An open ONNX file. In `shapes`, sides that are not fixed are not ints."""
+    """A loaded ONNX file. `shapes` are those of its inputs; a free dimension is not an int."""
 
     shapes: list[list[Any]]
     outputs: list[str]
@@ -147,7 +153,7 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
         side if isinstance(side, int) else max(1, round(own / MAP_SIDE)) * MAP_SIDE if maps else own
         for side, own in zip(sides, (height, width), strict=True)
     ]
-    # Area averaging is only for downscaling, because it repeats pixels when upscaling.
+    # Area averaging is only good for downscaling. It would upscale by repeating pixels.
     smaller = wanted[0] <= height and wanted[1] <= width
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     resized = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=method)
@@ -163,13 +169,13 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
             for name, rank in (("keypoints", 2), ("scores", 1), ("descriptors", 2))
             if (value := found.get(name)) is not None
         }
-    # Image borders coincide. They are half a pixel away from the centres of the outer pixels.
+    # Resizing keeps the image borders, which are half a pixel beyond the centres of outer pixels.
     scale = np.array([width / wanted[1], height / wanted[0]])
     return {**parts, "keypoints": (parts["keypoints"] + 0.5) * scale - 0.5}
 
 
 def _maxima(logits: np.ndarray, descriptors: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the maxima of (H, W) logits as keypoints, with descriptors from a (D, h, w) map."""
+    """Return local maxima of (H, W) logits as keypoints, with descriptors from a (D, h, w) map."""
     peaks = (logits == cv2.dilate(logits, MAP_WINDOW)) & (logits > MAP_LEAST_LOGIT)
     inner = slice(MAP_BORDER_PX, -MAP_BORDER_PX)
     xy = np.argwhere(peaks[inner, inner])[:, ::-1] + MAP_BORDER_PX
@@ -207,7 +213,8 @@ def _external_feature(
             )
         except Exception as error:  # external code may raise anything
             raise BaselineError(
-                f"{name} gave no keypoints and scores: {type(error).__name__}: {first_line(error)}"
+                f"{name} did not return usable keypoints and scores: "
+                f"{type(error).__name__}: {first_line(error)}"
             ) from error
 
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:

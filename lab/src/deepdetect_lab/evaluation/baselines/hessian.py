@@ -1,6 +1,6 @@
-"""Detect maxima of |det Hessian| at one scale and in scale space, ranked by this response.
+"""Detect maxima of |det Hessian| at one scale or at several scales, ranked by this response.
 
-This baseline takes one line of OpenCV per scale and no training. A learned ranking must beat it.
+This baseline is simple and needs no training, so a learned ranking of keypoints must beat it.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from deepdetect.io.image import luma
 from .method import PAPER_DESCRIPTOR, LocalFeature, OwnScaleDescriptor
 
 SIGMA_PX = 3.0
-"""Scale (Gaussian sigma) of the baseline with a single scale. Chosen by hand; not measured."""
+"""Gaussian sigma in pixels of the baseline with a single scale. Chosen by hand; not measured."""
 
 SIGMAS_PX = tuple(float(sigma) for sigma in np.geomspace(1.5, 9.1, 7))
-"""Scales (Gaussian sigmas) in pixels, each 1.35 times the previous scale. Chosen by hand; not
-measured."""
+"""Gaussian sigmas in pixels of the baseline with several scales, each 1.35 times the one before.
+Chosen by hand; not measured."""
 
 NMS_RADIUS = 2
 DISTANCE_PX = 2.0
-"""Keypoints, also of different scales, are at least this far apart. Chosen by hand; not
-measured."""
+"""Keypoints are at least this far apart, whether they have the same scale or not. Chosen by hand;
+not measured."""
 
 SIZE_PER_SIGMA = 5.0
-"""The diameter of a keypoint is 5 sigma, so it covers 2.5 sigma around its centre."""
+"""The size (diameter) of a keypoint is 5 times the sigma at which it was found."""
 
 
 def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Compute the scale-normalised |det H| sigma^4 of an image in [0, 1], (H, W) float32."""
+    """Compute the scale-normalised response |det Hessian| sigma^4 of an image, (H, W) float32."""
     scaled = gray.astype(np.float32) / 255 if gray.dtype == np.uint8 else gray
     smooth = cv2.GaussianBlur(scaled, (0, 0), sigma_px)
     second = np.array([[1, -2, 1]], np.float32)
@@ -41,7 +41,7 @@ def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:
 
 
 def detect_hessian(gray: np.ndarray, sigma_px: float = SIGMA_PX) -> Keypoints:
-    """Detect maxima of `hessian_response` in 5x5 windows and refine them to sub-pixel positions."""
+    """Detect maxima of `hessian_response` in windows of 5x5 pixels, with sub-pixel positions."""
     response = hessian_response(gray, sigma_px)
     options = SelectionOptions(threshold=0, nms_radius=NMS_RADIUS, subpixel=True)
     found = select_keypoints(response, options)
@@ -50,7 +50,7 @@ def detect_hessian(gray: np.ndarray, sigma_px: float = SIGMA_PX) -> Keypoints:
 
 
 def detect_hessian_scales(gray: np.ndarray) -> Keypoints:
-    """Detect maxima at each scale, without those close to a better keypoint of any scale."""
+    """Detect maxima at each scale; drop those near a keypoint of any scale with a higher score."""
     scales = [detect_hessian(gray, sigma) for sigma in SIGMAS_PX]
     xy, scores = (np.concatenate([getattr(p, name) for p in scales]) for name in ("xy", "scores"))
     sizes = np.repeat([SIZE_PER_SIGMA * sigma for sigma in SIGMAS_PX], [len(p) for p in scales])
@@ -64,7 +64,7 @@ HESSIAN: dict[str, LocalFeature] = {
         title,
         detect,
         PAPER_DESCRIPTOR.describe,
-        own_scale=OwnScaleDescriptor(0.5),  # this gives a size of 2.5 sigma; SIFT uses 2
+        own_scale=OwnScaleDescriptor(0.5),  # so its size is 2.5 sigma; in SIFT it is 2 sigma
     )
     for name, title, detect in (
         ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),
@@ -75,4 +75,4 @@ HESSIAN: dict[str, LocalFeature] = {
         ),
     )
 }
-"""The Hessian baselines by name, which only the standard protocol uses."""
+"""The Hessian baselines by name. Only the standard protocol uses them."""

@@ -1,4 +1,4 @@
-"""Local features, which benchmarks compare: a detector and the descriptor of its keypoints."""
+"""Local features, which benchmarks compare: pairs of a detector and a descriptor."""
 
 from __future__ import annotations
 
@@ -30,12 +30,14 @@ class LocalFeature:
 
     Attributes:
         detect: function from a (H, W, 3) uint8 RGB image to its keypoints.
-        describe: function from the image and its keypoints to (N, D) descriptors.
+        describe: function from the image and its N keypoints to (N, D) descriptors.
         binary: descriptors are compared by Hamming distance instead of Euclidean distance.
-        learned: descriptors were learned for their detector and need no ratio test.
-        version: everything besides the name that changes results. It is part of the cache key.
-        detection: cache key of the keypoints if several features share them.
-        own_scale: descriptor at the keypoints' own sizes and angles, if they have sizes.
+        learned: descriptors were learned together with their detector and need no ratio test.
+        version: text that differs if anything besides the name changes the results. It is part of
+            the key of cached results.
+        detection: key of the cached keypoints. Features with the same detector share it. The
+            default consists of name and version.
+        own_scale: descriptor that uses the keypoints' own sizes. None if they do not have sizes.
     """
 
     name: str
@@ -54,15 +56,16 @@ class LocalFeature:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Name and version, which together with the images determine the results."""
+        """Name and version, which identify the feature in the keys of cached results."""
         return self.name, self.version
 
 
 @dataclass(frozen=True)
 class PointDescriptor:
-    """A descriptor at a fixed size and angle for all keypoints, by default those of the paper.
+    """A descriptor with the same size and angle for all keypoints, by default those of the paper.
 
-    An angle of -1 means "unset" in OpenCV.
+    The paper's code leaves the angle at -1, which means "unset" in OpenCV. OpenCV's SIFT takes it
+    as an angle of -1 degree.
     """
 
     name: str = "sift"
@@ -70,21 +73,23 @@ class PointDescriptor:
     angle_deg: float = -1.0
 
     def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        """Return (N, D) float32 descriptors."""
+        """Return the (N, D) descriptors of N keypoints."""
         return DESCRIPTORS[self.name](luma(rgb), features.xy, self.size_px, self.angle_deg)
 
 
 PAPER_DESCRIPTOR = PointDescriptor()
 
 COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
-"""The standard protocol uses this descriptor for detectors without a descriptor of their own."""
+"""The standard protocol uses this descriptor for classical detectors and DeepDetect, so that only
+their keypoints differ. External detectors get it if they have no descriptor of their own."""
 
 
 @dataclass(frozen=True)
 class OwnScaleDescriptor:
-    """RootSIFT at the keypoints' own sizes and angles; by default the angle of the main gradient.
+    """RootSIFT descriptors at the keypoints' own sizes and angles.
 
-    A descriptor covers a square whose side is six times the size. `size_factor` scales the size.
+    Keypoints without angles get the angle of the dominant gradient around them. A descriptor covers
+    a square whose side is six times the size (diameter) of the keypoint times `size_factor`.
     """
 
     size_factor: float = 1.0
@@ -102,7 +107,7 @@ class OwnScaleDescriptor:
 
 
 def with_own_scale(feature: LocalFeature) -> LocalFeature:
-    """Return a feature whose keypoints are described at their own sizes and angles."""
+    """Return a copy of a feature whose descriptors use the keypoints' own sizes and angles."""
     if feature.own_scale is None:
         raise OptionError(f"the keypoints of {feature.title} have no sizes of their own")
     title = f"{feature.title}, own size and angle"
@@ -110,14 +115,14 @@ def with_own_scale(feature: LocalFeature) -> LocalFeature:
 
 
 def with_common_descriptor(feature: LocalFeature) -> LocalFeature:
-    """Return a feature with the descriptor that the standard protocol uses for all detectors."""
+    """Return a copy of a feature with `COMMON_DESCRIPTOR`, for the standard protocol."""
     return _described(feature, COMMON_DESCRIPTOR, f"{feature.name}-common", feature.title)
 
 
 def _described(
     feature: LocalFeature, descriptor: PointDescriptor | OwnScaleDescriptor, name: str, title: str
 ) -> LocalFeature:
-    """Describe each position once, since SIFT repeats positions with several orientations."""
+    """Return a copy with another descriptor. Repeated positions, as in SIFT, are described once."""
     return replace(
         feature,
         name=name,
@@ -139,7 +144,7 @@ def deepdetect_feature(
     descriptor: PointDescriptor = PAPER_DESCRIPTOR,
     version: str = "",
 ) -> LocalFeature:
-    """Make a local feature of a DeepDetect, or of any object with `heatmap` and a version."""
+    """Make a local feature from a DeepDetect, or from any detector with `heatmap` and a version."""
     if not version:
         digest = file_digest(detector.weights)[:16]
         version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"
@@ -151,7 +156,7 @@ def deepdetect_feature(
 
 
 def points_feature(ranker: str | Path | None = None) -> LocalFeature:
-    """Make a local feature of ranked multi-scale keypoints at native image resolution."""
+    """Make a local feature from the ranked multi-scale keypoints of a `PointDetector`."""
     detector = PointDetector(None, resolution="native", ranker=ranker)
     return LocalFeature(
         "deepdetect-points",

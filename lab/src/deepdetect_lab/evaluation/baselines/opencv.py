@@ -1,4 +1,4 @@
-"""OpenCV's classical detectors, with default settings and with the paper's low settings."""
+"""OpenCV's classical detectors, with default settings and with the low thresholds of the paper."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ MAX_CORNERS = 1_000_000
 KD_TREES = "bytes by kd-trees"
 
 AGAST_7_12D = 1
-"""AgastFeatureDetector::AGAST_7_12d, the type of the paper's low settings."""
+"""OpenCV's AgastFeatureDetector::AGAST_7_12d: the paper's low settings use this type of AGAST."""
 
 OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
-    # Lowe 2004; Rublee et al. 2011; Leutenegger et al. 2011.
+    # SIFT: Lowe 2004. ORB: Rublee et al. 2011. BRISK: Leutenegger et al. 2011.
     "sift": ("SIFT", "SIFT_create", {}),
     "sift-low": (
         "SIFT, low settings",
@@ -30,11 +30,11 @@ OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
         {"nOctaveLayers": 4, "contrastThreshold": 1e-9, "edgeThreshold": 100, "sigma": 0.7},
     ),
     "orb": ("ORB", "ORB_create", {}),
-    "orb-many": ("ORB", "ORB_create", {"nfeatures": 10_000}),  # the default stops at 500
+    "orb-many": ("ORB", "ORB_create", {"nfeatures": 10_000}),  # the default is 500
     "orb-low": ("ORB, low settings", "ORB_create", {"nfeatures": 1_000_000, "fastThreshold": 1}),
     "brisk": ("BRISK", "BRISK_create", {}),
     "brisk-low": ("BRISK, low settings", "BRISK_create", {"thresh": 1, "octaves": 4}),
-    # Rosten and Drummond 2006 (9-16); Mair et al. 2010.
+    # FAST (type 9-16): Rosten and Drummond 2006. AGAST: Mair et al. 2010.
     "fast": ("FAST", "FastFeatureDetector_create", {}),
     "fast-low": (
         "FAST, low settings",
@@ -48,7 +48,8 @@ OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
         {"threshold": 1, "nonmaxSuppression": False, "type": AGAST_7_12D},
     ),
 }
-"""Title, OpenCV factory and changed settings of each detector. Low settings are from the paper."""
+"""Title, OpenCV factory, and settings that differ from OpenCV's defaults, by name of the detector.
+The paper's "low settings" have such low thresholds that detectors find many keypoints."""
 
 
 def _make(name: str) -> cv2.Feature2D:
@@ -57,10 +58,10 @@ def _make(name: str) -> cv2.Feature2D:
 
 
 def describe_with(descriptor: cv2.Feature2D, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-    """Compute OpenCV's descriptors, one row per keypoint.
+    """Compute an (N, D) array of OpenCV descriptors, one row per keypoint.
 
-    If a descriptor cannot be computed, for example ORB near the border, its row is all 0. Such a
-    row matches only by chance, and the number of keypoints stays the same.
+    OpenCV leaves out some keypoints, for example ORB those near the border. Their rows are all 0,
+    which matches only by chance, so that the number of keypoints stays the same.
     """
     dtype = np.uint8 if descriptor.descriptorType() == cv2.CV_8U else np.float32
     rows = np.zeros((len(features), descriptor.descriptorSize()), dtype)
@@ -93,7 +94,7 @@ def _opencv(name: str) -> LocalFeature:
 
 
 def self_described(name: str) -> LocalFeature:
-    """Make a local feature of `OPENCV_SETTINGS` that also describes with these settings."""
+    """Make a local feature that detects and also describes with these `OPENCV_SETTINGS`."""
     return replace(
         _opencv(name),
         name=f"{name}-self-described",
@@ -104,10 +105,10 @@ def self_described(name: str) -> LocalFeature:
 def _harris(
     name: str, title: str, block_size: int, aperture: int, k: float, quality: float
 ) -> LocalFeature:
-    """Make the Harris detector (1988) as in the paper.
+    """Make a Harris detector (Harris and Stephens, 1988) that works as in the paper.
 
-    Every pixel whose response, dilated by 3x3, exceeds a fraction of the largest response is a
-    keypoint.
+    The response is dilated with a 3x3 window. Every pixel where it exceeds `quality` times the
+    largest response is a keypoint, so a corner gives several keypoints.
     """
 
     def detect(rgb: np.ndarray) -> Keypoints:
@@ -130,7 +131,7 @@ def _pixels(response: np.ndarray, chosen: np.ndarray) -> Keypoints:
 
 
 def _shi_tomasi(name: str, title: str, quality: float, k: float) -> LocalFeature:
-    """Make the Shi-Tomasi detector as in the paper, with the Harris response."""
+    """Make the paper's Shi-Tomasi detector, which in fact uses the Harris response."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
         corners, scores = cv2.goodFeaturesToTrackWithQuality(
@@ -142,7 +143,7 @@ def _shi_tomasi(name: str, title: str, quality: float, k: float) -> LocalFeature
 
 
 def _shi_tomasi_eigenvalue(rgb: np.ndarray) -> Keypoints:
-    """Detect sub-pixel Shi-Tomasi corners (1994), ranked by the smaller eigenvalue."""
+    """Detect Shi-Tomasi corners (1994) at sub-pixel positions, ranked by the smaller eigenvalue."""
     gray = luma(rgb)
     corners, scores = cv2.goodFeaturesToTrackWithQuality(
         gray, MAX_CORNERS, 1e-4, 1, None, blockSize=3
@@ -150,7 +151,7 @@ def _shi_tomasi_eigenvalue(rgb: np.ndarray) -> Keypoints:
     if corners is not None:
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
         fine = cv2.cornerSubPix(gray, corners.copy(), (2, 2), (-1, -1), criteria)
-        # A refinement that moves farther than 1 px has no corner to converge to.
+        # A refinement by 1 px or more has not converged to this corner, so it is undone.
         stayed = np.abs(fine - corners).max(2, keepdims=True) < 1
         corners = np.where(stayed, fine, corners)
     return _corners(rgb, corners, scores)
@@ -171,7 +172,7 @@ CLASSICAL: dict[str, LocalFeature] = {
     "shi-tomasi": _shi_tomasi("shi-tomasi", "Shi-Tomasi", 0.01, 0.04),
     "shi-tomasi-low": _shi_tomasi("shi-tomasi-low", "Shi-Tomasi, low settings", 1e-6, 0.001),
 }
-"""The classical detectors of the paper's tables."""
+"""The classical detectors of the paper's tables, with default and with low settings, by name."""
 
 STANDARD: dict[str, LocalFeature] = {
     "sift": CLASSICAL["sift"],
@@ -184,12 +185,15 @@ STANDARD: dict[str, LocalFeature] = {
         "shi-tomasi-eigenvalue", "Shi-Tomasi, sub-pixel", _shi_tomasi_eigenvalue, "SIFT_create"
     ),
 }
-"""Detectors that replace those with default settings when the best N keypoints are compared. They
-give enough keypoints, ranked by score."""
+"""Classical detectors of the standard protocol, which compares the best N keypoints. ORB, Harris
+and Shi-Tomasi differ from `CLASSICAL` so that they find enough keypoints and rank them by score."""
 
 
 def with_kd_trees(features: Iterable[LocalFeature]) -> list[LocalFeature]:
-    """Add a copy of each binary feature with low settings whose descriptor bytes kd-trees match."""
+    """After binary features with low settings, insert copies whose bytes are matched as numbers.
+
+    In the paper, kd-trees match binary descriptors in this way, by the Euclidean distance of bytes.
+    """
     found: list[LocalFeature] = []
     for feature in features:
         found.append(feature)

@@ -14,7 +14,7 @@ from .method import PAPER_DESCRIPTOR, LocalFeature
 
 
 class RandomDetector:
-    """A detector with random probabilities, which are drawn anew in each call."""
+    """A detector that gives each pixel a random probability. Each call draws new ones."""
 
     def __init__(self, seed: int = 0) -> None:
         self._generator = np.random.default_rng(seed)
@@ -33,10 +33,10 @@ class AllPixels:
 
 
 def random_feature(like: LocalFeature, name: str = "random") -> LocalFeature:
-    """Make a baseline of random pixels, as many per image as the feature `like` finds."""
+    """Make a baseline that marks as many random pixels in each image as `like` finds keypoints."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
-        # The seed is computed from the image, so the two images of a pair get different pixels.
+        # The seed is computed from the image, so that the images of a pair get different pixels.
         seed = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:4], "little")
         count = len(like.detect(rgb))
         size = (rgb.shape[1], rgb.shape[0])
@@ -52,7 +52,7 @@ def random_feature(like: LocalFeature, name: str = "random") -> LocalFeature:
 
 
 def all_pixels_feature() -> LocalFeature:
-    """Make a baseline of all pixels, whose best N form a regular grid for any N."""
+    """Make a baseline that marks all pixels, ranked so that the best N form a grid for any N."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
         height, width = rgb.shape[:2]

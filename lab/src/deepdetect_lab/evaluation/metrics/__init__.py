@@ -1,1 +1,1 @@
-"""Metrics of keypoints, matches, homographies, poses and disparities, with ground truth."""
+"""Compare keypoints, matches, homographies, poses and disparities with ground truth."""

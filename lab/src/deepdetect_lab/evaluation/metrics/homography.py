@@ -1,4 +1,4 @@
-"""Evaluate points, matches and estimated homographies with the true homography."""
+"""Evaluate points, matches and estimated homographies of an image pair by its true homography."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from deepdetect.geometry.transforms import transfer_errors, transform_points
 CORNER_THRESHOLDS_PX = (1.0, 3.0, 5.0)
 
 MATCH_THRESHOLDS_PX = tuple(range(1, 11))
-"""Thresholds of the mean matching accuracy, as in D2-Net's paper."""
+"""Error thresholds of the mean matching accuracy, 1 to 10 pixels as in D2-Net's paper."""
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(width, height) of each of the two images."""
 
 
 def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return which points (N, 2) are inside an image, (N,) bool; false if a point is not finite.
+    """Return an (N,) bool mask of the (N, 2) points that are inside an image of (width, height).
 
-    The image extends half a pixel beyond the centres of its outer pixels.
+    The image extends half a pixel beyond the centres of its outer pixels. Points that are not
+    finite are outside.
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
     return np.all((points >= -0.5) & (points < np.asarray(size) - 0.5), axis=1)
@@ -30,10 +31,11 @@ def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def project_visible(
     points: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Map points (N, 2) into another image. Points that the other image does not show become NaN.
+    """Map (N, 2) points into another image. Points that the other image does not show become NaN.
 
-    A homography also maps points beyond the horizon, where the plane is invisible. There it flips
-    the orientation: the determinant of its Jacobian, det(H) / depth^3, is negative.
+    A homography also maps points of the plane that are behind the other camera. They may land
+    inside its image, although it cannot show them. At these points the homography mirrors: the
+    determinant of its Jacobian, det(H) / depth^3, is negative. So they also become NaN.
     """
     depth = np.asarray(points, np.float64).reshape(-1, 2) @ homography[2, :2] + homography[2, 2]
     mapped = transform_points(points, homography)
@@ -49,12 +51,14 @@ def match_accuracy(
     homography: np.ndarray,
     sizes: Sizes,
 ) -> dict[Any, Any]:
-    """Evaluate matched positions (M, 2) of two images, given all keypoints (N, 2) of both.
+    """Evaluate the (M, 2) matches of two images by the true homography from first to second.
 
-    Returns the number of "matches", and three values for each threshold of 1 to 10 px in the second
-    image. ("correct", px) is the number of matches within the threshold. ("precision", px) is their
-    fraction, D2-Net's matching accuracy. ("score", px) is Mikolajczyk's matching score, the number
-    of correct matches in the overlap divided by the number of keypoints that could have a match.
+    `keypoints0` and `keypoints1` are all keypoints, (N, 2), matched or not. Errors are distances in
+    the second image. Returns the number of "matches", and three values for each threshold `px` from
+    1 to 10: ("correct", px) is the number of matches with an error of at most px. ("precision", px)
+    is their fraction of all matches, called matching accuracy by D2-Net. ("score", px) is
+    Mikolajczyk's matching score: the number of correct matches between points that both images
+    show, divided by the number of keypoints in the overlap, in the image that has fewer there.
     """
     errors = transfer_errors(points0, points1, homography)
     back = np.linalg.inv(homography)
@@ -76,10 +80,10 @@ def match_accuracy(
 
 
 def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the mean distance between the image corners mapped by two homographies, in pixels.
+    """Map the image corners by the estimated and the true homography; return their mean distance.
 
-    Corners are the centres of corner pixels, as in SuperPoint's metric (DeTone, 2018). The error is
-    infinite without an estimate.
+    The distance is in pixels. Corners are the centres of the corner pixels, as in SuperPoint's
+    metric (DeTone, 2018). Without an estimated homography the error is infinite.
     """
     if estimated is None:
         return float("inf")
@@ -91,15 +95,16 @@ def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int
 
 
 def accuracy_at(errors: Sequence[float], threshold: float) -> float:
-    """Return the fraction of the errors that are at most the threshold; 0 if there are none."""
+    """Return the fraction of the errors that are at most the threshold; 0 without errors."""
     return float(np.mean(np.asarray(errors) <= threshold)) if len(errors) else 0.0
 
 
 def area_under_curve(errors: Sequence[float], threshold: float) -> float:
-    """Return the area under the cumulative error curve up to a threshold, divided by it.
+    """Return the area under the cumulative error curve (AUC) from 0 to a threshold, in [0, 1].
 
-    As in SuperGlue and glue-factory, the curve consists of straight lines from (0, 0). So the area
-    exceeds the mean of `accuracy_at` by up to half the share of one error.
+    The area is divided by the threshold. As in SuperGlue and glue-factory, straight lines connect
+    (0, 0) with the points (error, fraction of errors up to this one). With N errors the result
+    exceeds the area under the step function `accuracy_at` by at most 1 / (2 N).
     """
     if not len(errors):
         return 0.0

@@ -1,4 +1,4 @@
-"""Errors of estimated cameras: relative poses of pairs, or absolute poses after alignment."""
+"""Errors of estimated cameras: of relative poses, or of absolute poses aligned with true ones."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from deepdetect.geometry.similarity import least_squares_similarity
 from deepdetect.geometry.transforms import epipolar_errors
 
 POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
-"""Thresholds of the AUC in degrees, as in SuperGlue's paper."""
+"""Thresholds of the AUC (area under the cumulative error curve) in degrees, as in SuperGlue's
+paper."""
 
 LINE_WIDTH = 0.01
 """Camera centres count as collinear if their spread across a line is below this fraction of the
 spread along it. Chosen by hand; not measured."""
 
 EPIPOLAR_THRESHOLD_PX = 1.0
-"""A match agrees with the true pose if its Sampson distance is below this. Chosen by hand."""
+"""A match agrees with the true pose if its Sampson distance in pixels is below this. Chosen by
+hand."""
 
 
 def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
@@ -31,8 +33,9 @@ def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
 def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
     """Return the angle between the directions of two translations, in degrees from 0 to 180.
 
-    SuperGlue and glue-factory count an opposite direction as correct. Here it is wrong, because
-    points must be in front of the cameras. If the true translation is 0, the error is 0.
+    SuperGlue and glue-factory count the opposite direction as correct. Here its error is 180
+    degrees, because it would put the points behind the cameras. If the true translation is 0, the
+    error is 0.
     """
     across = float(np.linalg.norm(np.cross(estimated, true)))
     return float(np.degrees(np.arctan2(across, np.dot(estimated, true))))
@@ -41,10 +44,10 @@ def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
 def epipolar_inlier_ratio(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> float:
-    """Return the fraction of the matches whose Sampson distance is under the threshold.
+    """Return the fraction of matches whose Sampson distance is below `EPIPOLAR_THRESHOLD_PX`.
 
-    Wrong matches on the correct epipolar line also agree, so this is an upper bound of the
-    precision. It is 0 without matches.
+    Wrong matches that lie on the correct epipolar line count as inliers, so the fraction
+    overestimates the precision of the matches. It is 0 without matches.
     """
     if not len(points0):
         return 0.0
@@ -55,12 +58,13 @@ def epipolar_inlier_ratio(
 def camera_errors(
     views: Sequence[PosedView], truth: Sequence[PosedView]
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Compare three or more cameras with ground truth after alignment by a similarity transform.
+    """Align N >= 3 estimated cameras with the true ones by a similarity transform; compare them.
 
-    The transform fits the centres to the true ones by least squares (Umeyama, 1991). Returns the
-    distances of the centres in units of the ground truth, the angles between the rotations in
-    degrees, and the scale. For collinear centres the rotation about the line is undetermined, so
-    the angles are NaN.
+    The transform fits the estimated camera centres to the true ones by least squares (Umeyama,
+    1991). Returns three values: the (N,) distances of the aligned centres from the true ones, in
+    the unit of the ground truth; the (N,) angles between aligned and true rotations in degrees; and
+    the scale of the transform. If the true centres are collinear, the angles are NaN, because a
+    rotation about the line is undetermined. All values are NaN if no transform can be fitted.
     """
     own = np.array([view.centre for view in views])
     true = np.array([view.centre for view in truth])
@@ -82,10 +86,11 @@ def camera_errors(
 def relative_pose_errors(
     views: Mapping[str, PosedView], truth: Mapping[str, PosedView]
 ) -> list[float]:
-    """Return the error of each pair's relative pose in degrees, for `area_under_curve`.
+    """Return the error of the relative pose for each pair of true cameras, in degrees.
 
-    The error is the larger of the angular errors of rotation and translation. It is infinite if one
-    of the two cameras is missing. No alignment is needed.
+    The error is the larger of the angular errors of rotation and translation. It is infinite if
+    the estimate of one of the two cameras is missing. Relative poses need no alignment with the
+    ground truth. `area_under_curve` summarises the errors.
     """
     errors = []
     for pair in itertools.combinations(sorted(truth), 2):

@@ -1,9 +1,9 @@
-"""Repeatability of keypoints, their coverage, and their fraction on the foreground.
+"""Measure repeatability of keypoints, their coverage, and their fraction on the foreground.
 
-In the paper's definition several keypoints may share a partner and all keypoints count, so a full
-grid of pixels scores best. With mutual nearest neighbours a keypoint has at most one partner, and
-only points in the overlap count. The chance level is the repeatability of equally many random
-points.
+The repeatability has two definitions. In the paper's, several keypoints may share a partner in the
+other image, and all keypoints count, so a detector that marks every pixel scores best. With mutual
+nearest neighbours a keypoint has at most one partner, and only keypoints in the overlap of the two
+images count. For comparison, the chance level is the repeatability of as many random points.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from deepdetect.geometry.transforms import transform_points
 from .homography import Sizes, project_visible
 
 CHANCE_POINTS = 20_000
-"""Random points for the chance level are drawn repeatedly up to this total number, so that the
-level has little noise for few keypoints. Chosen by hand; not measured."""
+"""The chance level of few keypoints would be noisy. So random points are drawn repeatedly until
+their total number reaches this, and the level is the mean. Chosen by hand; not measured."""
 
 MAX_DRAWS = 100
-"""The chance level uses at most this number of draws, because few keypoints would need too many."""
+"""The chance level is the mean of at most this number of draws. Otherwise very few keypoints would
+need thousands of draws to reach `CHANCE_POINTS`."""
 
 MIN_POINTS_FOR_THREADS = 20_000
 
 CELL_PX = 32
-"""Side of the square cells of the coverage. Chosen by hand; not measured."""
+"""`coverage` divides an image into square cells with this side in pixels. Chosen by hand; not
+measured."""
 
 
 def repeatability_paper(
@@ -37,9 +39,10 @@ def repeatability_paper(
 ) -> float:
     """Return the repeatability as the paper's code computes it, clipped at 1.
 
-    It is the number of points of the first image that map strictly closer than the radius to some
-    point of the second, divided by the smaller of the two counts. The counts include points outside
-    the overlap, several points may share a partner, and chance is not subtracted.
+    It is the number of points of the first image that the homography maps strictly closer than the
+    radius to any point of the second, divided by the number of points in the image that has fewer.
+    Points outside the overlap of the images count, several points may share a partner, and the
+    chance level is not subtracted.
     """
     fewest = min(len(points0), len(points1))
     if not fewest:
@@ -58,12 +61,13 @@ def mutual_nn_repeatability(
     radii_px: Sequence[float] = (1.0, 2.0, 3.0),
     with_chance: bool = True,
 ) -> list[tuple[float, float, float]]:
-    """Measure the repeatability by mutual nearest neighbours in the overlap, and its chance level.
+    """Measure the repeatability by mutual nearest neighbours in the overlap of two images.
 
-    Returns three values for each radius. The first is the number of mutual neighbours divided by
-    the smaller number of keypoints in the overlap. The second is the same for equally many random
-    points, or NaN if not requested. Random points are at pixel centres if all keypoints are. The
-    third is the mean distance of the partners in pixels, or NaN without partners.
+    Returns three values for each radius. The first, the repeatability, is the number of pairs of
+    mutual nearest neighbours within the radius, divided by the smaller number of keypoints in the
+    overlap. The second, the chance level, is the repeatability of as many random points (at pixel
+    centres if all keypoints are), or NaN if it is not requested. The third is the mean distance
+    of the pairs in pixels, or NaN without pairs.
     """
     visible = _in_overlap(points0, points1, homography, sizes)
     distances = _mutual_distances(*visible, max(radii_px))
@@ -83,7 +87,7 @@ def mutual_nn_repeatability(
 def _in_overlap(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, sizes: Sizes
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of both images in the overlap, in pixels of the second image."""
+    """Return the points of each image that the other image shows, in the second's coordinates."""
     mapped = project_visible(points0, homography, sizes[1])
     back = project_visible(points1, np.linalg.inv(homography), sizes[0])
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -95,8 +99,11 @@ def _kd_tree(points: np.ndarray) -> Any:
 
 
 def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances (infinite beyond the radius) and indices of the nearest tree points."""
-    # The upper bound saves time. It is exclusive in the search, so it is just above the radius.
+    """For each point, return the distance to the nearest point of the tree, and its tree index.
+
+    Distances beyond the radius are infinite.
+    """
+    # An upper bound saves time. The tree leaves the bound itself out, so it must exceed the radius.
     bound = np.nextafter(radius_px, np.inf)
     workers = -1 if min(tree.n, len(points)) > MIN_POINTS_FOR_THREADS else 1
     distance, rows = tree.query(points, distance_upper_bound=bound, workers=workers)
@@ -120,11 +127,12 @@ def _chance(
     radii_px: Sequence[float],
     on_pixels: bool,
 ) -> list[float]:
-    """Return the repeatability at each radius of equally many random points in the overlap.
+    """Return the chance level for each radius: the repeatability of random points in the overlap.
 
-    Random points are at pixel centres only if the keypoints are. If little moves between the
-    images, points at pixel centres coincide more often than others: five pixel centres are within
-    1 px of a centre, although the area is 3.14 pixels.
+    `counts` is the number of random points in each image. If `on_pixels`, they are at pixel
+    centres, as the keypoints are. This matters if the images hardly differ by motion: then points
+    at pixel centres have neighbours within 1 px more often than points elsewhere, because a circle
+    of this radius around a pixel centre contains five centres, but has an area of 3.14 pixels.
     """
     fewest = min(counts)
     if not fewest:
@@ -134,7 +142,8 @@ def _chance(
     draws = min(-(-CHANCE_POINTS // fewest), MAX_DRAWS)
     found = np.zeros(len(radii_px))
     for _ in range(draws):
-        # Classical detectors may mark a pixel several times. Then random points also repeat.
+        # Classical detectors may find more keypoints than pixels, as they mark some pixels several
+        # times. Then random points are drawn with replacement.
         drawn = [
             grid[generator.choice(len(grid), count, replace=count > len(grid))]
             for grid, count in zip(grids, counts, strict=True)
@@ -146,9 +155,9 @@ def _chance(
     return [float(value) for value in found / (draws * fewest)]
 
 
-@lru_cache(maxsize=2)  # all keypoint budgets of a pair use the same grids
+@lru_cache(maxsize=2)  # a pair is measured at several numbers of keypoints with the same grids
 def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels of both images in the overlap, in coordinates of the second image."""
+    """Return the pixels of each image that the other image shows, in the second's coordinates."""
 
     def grid(size: tuple[int, int]) -> np.ndarray:
         row, column = np.indices((size[1], size[0]))
@@ -159,9 +168,9 @@ def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.
 
 
 def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the fraction of the grid cells of a (width, height) image that contain a keypoint.
+    """Return the fraction of an image's square cells that contain one of the (N, 2) keypoints.
 
-    Cells at the right and lower border may be smaller.
+    `size` is (width, height). Cells at the right and lower border may be smaller than `CELL_PX`.
     """
     columns, rows = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
     position = np.floor((np.asarray(xy, np.float64).reshape(-1, 2) + 0.5) / CELL_PX).astype(int)
@@ -170,9 +179,9 @@ def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
 
 
 def foreground_fraction(xy: np.ndarray, foreground: np.ndarray) -> float:
-    """Return the fraction of (N, 2) keypoints on an (H, W) bool foreground; NaN without keypoints.
+    """Return the fraction of (N, 2) keypoints on the foreground, an (H, W) bool mask.
 
-    The metric is defined in section IV-A of the paper.
+    The metric is defined in section IV-A of the paper. It is NaN without keypoints.
     """
     if not len(xy):
         return float("nan")

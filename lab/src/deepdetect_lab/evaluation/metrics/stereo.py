@@ -1,4 +1,4 @@
-"""Evaluate matches and points of a rectified stereo pair with its true disparity."""
+"""Evaluate matches and disparities of a rectified stereo pair by its true disparity map."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ DISPARITY_TOLERANCES_PX = (0.5, 1.0, 2.0, 4.0)
 def stereo_score(
     points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray
 ) -> dict[str, float]:
-    """Score matches (N, 2) with the true disparity (H, W) of the left image; NaN is unknown."""
+    """Score (N, 2) matches by the left image's (H, W) true disparity, NaN where unknown."""
     return score_errors(disparity_errors(points0, points1, disparity))
 
 
 def disparity_scores(
     pixels: np.ndarray, disparity: np.ndarray, truth: np.ndarray
 ) -> dict[str, float]:
-    """Evaluate disparities (N,) at pixels (N, 2) with the true disparity (H, W); NaN is unknown.
+    """Evaluate estimated disparities (N,) at pixels (N, 2) of the left image.
 
-    Returns values by column title. "1 - bad-t" and the mean error are those of points with ground
-    truth. The completeness is the fraction of pixels with ground truth (occluded ones included)
-    that have a point with an error of at most 1 px. Further values are the number and accuracy of
-    points whose counterpart is outside the right image.
+    `truth` is the true disparity map of the left image, (H, W), NaN where unknown. Returns values
+    by column title. "1 - bad-t", the fraction of errors up to t pixels, and "EPE", the mean error,
+    are computed from the points with ground truth. The completeness is the fraction of pixels with
+    ground truth, occluded ones included, that have a point with an error of at most 1 px. The
+    F-score is the harmonic mean of "1 - bad-1" and the completeness. The last two values are the
+    number of points whose true counterpart is outside the right image, and the fraction of these
+    points with an error of at most 1 px.
     """
     disparity = np.asarray(disparity, np.float64)
     columns, rows = np.rint(np.asarray(pixels, np.float64).reshape(-1, 2)).astype(np.int64).T
@@ -36,7 +39,7 @@ def disparity_scores(
     known = np.isfinite(errors)
     near = errors[known]
     accuracy = {t: _fraction(near <= t) for t in DISPARITY_TOLERANCES_PX}
-    complete = np.zeros(truth.shape, bool)  # each pixel counts once
+    complete = np.zeros(truth.shape, bool)  # a pixel with several points counts once
     good = np.flatnonzero(known)[near <= TOLERANCE_PX]
     complete[rows[good], columns[good]] = True
     completeness = _fraction(complete[np.isfinite(truth)])

@@ -1,1 +1,1 @@
-"""Protocols: measurements on data of one kind, and their tables and figures."""
+"""Protocols: how to measure on data of one kind, and which tables and figures to make."""

@@ -1,4 +1,4 @@
-"""The standard protocol with a dark or blurred second image in each pair."""
+"""The standard protocol on pairs whose second image is darkened or blurred."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from ..run import Run
 from .standard import standard_section
 
 TEXT = (
-    "Dark and blurred image copies are simulated in linear light with fixed random numbers. "
-    "With 1/4 or 1/8 of the light, white gives 2,500 or 1,250 electrons instead of 10,000. "
-    "Shot noise is Poisson noise, read noise has a standard deviation of 3 electrons, and the "
-    "result has 8 bits. The direction of motion blur is random for each image. Only the second "
-    "image of each pair is degraded."
+    "The second image of each pair is replaced by a darkened or blurred copy; the first image is "
+    "unchanged. Copies are simulated in linear light, with random numbers that are the same in "
+    "each run. In full light a white pixel receives 10,000 electrons, with 1/4 or 1/8 of the light "
+    "2,500 or 1,250. In dark copies, shot noise is Poisson noise and read noise has a standard "
+    "deviation of 3 electrons. Copies have 8 bits. Each image has its own random direction of "
+    "motion blur."
 )
 
 
 def degraded_sections(
     run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], key: str, title: str
 ) -> list[Section]:
-    """Measure and tabulate all features of the standard protocol, with each degradation."""
+    """Run the standard protocol with each degradation, if "degraded" is among the protocols."""
     sections = []
     for name, degradation in DEGRADATIONS.items() if "degraded" in options.protocols else ():
         made = (
@@ -43,7 +44,7 @@ def degraded_sections(
 
 
 def degraded_pair(pair: PlanarPair, degradation: Degradation, folder: Path) -> PlanarPair:
-    """Return a pair with a degraded copy as second image, created in a folder if missing."""
+    """Return the pair with a degraded copy of its second image, a file that is made if missing."""
     digest = file_digest(pair.second)[:16]
     path = folder / "degraded" / f"{digest}-{degradation.name}-v{degradation.version}.png"
     if not path.exists():

@@ -1,7 +1,9 @@
-"""Measure the coverage of the images by dense points, and how well independent halves agree.
+"""Measure which share of each image dense points cover, and how accurate their depths are.
 
-The dense points are compared with OpenCV's semi-global matching of pairs rectified by the same
-cameras, or with clouds that other programs, such as OpenMVS or COLMAP, made from the same model.
+Without ground truth, the accuracy is estimated by reconstructing two halves of the images
+separately and comparing their depths. Two alternatives are measured in the same way: OpenCV's
+semi-global matching of image pairs that the same cameras rectify, and clouds that other programs,
+such as OpenMVS or COLMAP, made from the same model.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ from .stereo_pipelines import sgbm_disparity
 SGBM = "SGBM, OpenCV"
 
 APART = 0.01
-"""Two depths belong to different surfaces if their relative difference is larger than this. Chosen
-by hand."""
+"""Two depths of a pixel are "apart", on different surfaces, if their relative difference is larger
+than this. Chosen by hand."""
 
 DENSE_COLUMNS = {
     "scene": "",
@@ -49,20 +51,22 @@ DENSE_COLUMNS = {
 }
 
 DENSE_NOTE = (
-    "True intrinsics are used where known. Share: fraction of the attempted pixels of an image "
-    "that have a point in its own depth map, or that see any point of the cloud; mean over the "
-    "images. Error: distance from a point to the matches of its image alone. Halves: two halves of "
-    "the images, taken alternately, are reconstructed separately. Where both have a point, columns "
-    "give the relative difference of the depths and the share of differences over 1 %. CPU "
-    "seconds: time for depth maps and their fusion. SGBM: each image is matched with its best "
-    "neighbour after rectification by the same cameras, where they overlap. Instead of halves, its "
-    "depth maps from the best and the second-best neighbour are compared."
+    "True intrinsics are used where they are known. Share, own map: fraction of the pixels of the "
+    "depth maps that have a point in the image's own depth map; share, all maps: fraction of them "
+    "that see any point of the fused cloud. Both are means over the images. Error: distance in "
+    "pixels between a point and the matches of the image whose depth map gave the point. Halves: "
+    "every other image belongs to the first half, the rest to the second, and each half gets its "
+    "own dense points. Where an image sees points of both halves, the columns give the relative "
+    "difference of the two depths and the share of differences over 1 %. CPU seconds: time for the "
+    "depth maps and their fusion. SGBM: each image is rectified with its best neighbour by the "
+    "same cameras and matched. Instead of halves, the depths of an image from its best and from "
+    "its second-best neighbour are compared."
 )
 
 
 CELL_PX = 4
-"""Clouds are compared in square cells with this side in pixels, since other programs reconstruct
-only every second pixel."""
+"""Clouds are compared in square cells of an image with this side in pixels, since other programs
+reconstruct only every second pixel."""
 
 CLOUD_COLUMNS = {
     "cloud": "",
@@ -73,27 +77,28 @@ CLOUD_COLUMNS = {
 }
 
 CLOUD_NOTE = (
-    "Share: fraction of the cells of 4 x 4 pixels that see a point, in images of at most 2,000 "
-    "pixels a side; mean over the images. From the first: comparison with the first cloud in cells "
-    "where both have a point: the relative difference of the depths, and the share of cells in "
-    "which it is over 1 %."
+    "Each image, scaled down to at most 2,000 pixels a side, is divided into cells of 4x4 pixels. "
+    "Share: fraction of the cells that see a point of the cloud, mean over the images. From the "
+    "first: in cells that see this cloud and the first cloud, the relative difference of the two "
+    "depths (median), and the share of cells in which the difference is over 1 %."
 )
 
 
 def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
-    """Compare clouds in PLY files that share the coordinate frame of `model`/sparse/0.
+    """Compare point clouds in PLY files as seen by the cameras of a COLMAP model, `model`/sparse/0.
 
-    Returns the `CLOUD_COLUMNS` of each cloud. Unreadable files raise a DeepDetectError.
+    The clouds must be in the model's coordinate frame. Returns a row of `CLOUD_COLUMNS` for each
+    cloud. Raises a DeepDetectError if a file cannot be read.
     """
     sparse = model / "sparse" / "0"
     if not sparse.is_dir():
-        raise MissingFileError(f"there is no {sparse}: name the folder of a reconstruction")
+        raise MissingFileError(f"there is no folder {sparse}: name the folder of a reconstruction")
     pycolmap = import_pycolmap()
     try:
         views = read_sparse_model(pycolmap.Reconstruction(sparse)).views.values()
     except (ValueError, IndexError, RuntimeError) as error:
         raise InvalidFileError(
-            f"{sparse} is not a COLMAP model ({first_line(error)}): check it"
+            f"{sparse} is not a readable COLMAP model ({first_line(error)}): check the folder"
         ) from error
     limited = [limited_view(view) for view in views]
     rows: Rows = []
@@ -113,10 +118,12 @@ def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
 def measure_dense_points(
     images: Sequence[Path], cameras: Mapping[str, Camera], detector: PointDetector
 ) -> Row:
-    """Reconstruct and measure the dense points of images. Call it in a separate process.
+    """Reconstruct dense points from images and measure them. Call it in a separate process.
 
-    Returns the `DENSE_COLUMNS` from "points" on, and those of SGBM with its name and a space before
-    them. If there is no model, it returns only "points": 0.
+    `cameras` are the true intrinsics by file name; if it is empty, they are estimated. Returns the
+    values of `DENSE_COLUMNS` from "points" on, and those of semi-global matching under the same
+    names with the prefix "SGBM, OpenCV ". If the cameras cannot be reconstructed, it returns
+    {"points": 0}.
     """
     with tempfile.TemporaryDirectory(prefix="deepdetect-dense-") as scratch:
         options = MultiViewOptions(pairs="exhaustive")
@@ -166,9 +173,10 @@ def measure_dense_points(
 
 
 def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> Row:
-    """Compare pairs of depth maps of the same view. Unknown depths are infinite.
+    """Return how much the two depth maps in each pair differ; the maps show the same view.
 
-    Returns an empty row if no pixel has both depths.
+    Unknown depths are infinite. The keys of the row begin with `name`. The row is empty if no pixel
+    has a depth in both maps.
     """
     differences = []
     for first, second in pairs:
@@ -186,9 +194,10 @@ def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> R
 def _sgbm_points(
     one: tuple[np.ndarray, PosedView], other: tuple[np.ndarray, PosedView], seen: np.ndarray
 ) -> np.ndarray:
-    """Match an image with another by OpenCV's semi-global matching; return points (N, 3).
+    """Match two images by OpenCV's semi-global matching; return the (N, 3) points.
 
-    Each image is given as RGB and view. The disparity range is that of the sparse points.
+    Each image is given as its RGB pixels and its view. `seen` are the sparse points, (M, 3), which
+    determine the range of disparities.
     """
     (rgb0, view0), (rgb1, view1) = one, other
     moved = view1.relative_to(view0)
@@ -210,8 +219,8 @@ def _sgbm_points(
             (rgb0, rgb1), matrices, (turn0, turn1), (first, second), strict=True
         )
     ]
-    # Views of cameras above each other are matched along columns, all others along rows. The
-    # direction may be reversed.
+    # OpenCV rectifies cameras above each other so that matches are in the same column, and other
+    # cameras so that matches are in the same row. Disparities may be negative.
     axis = int(abs(second[1, 3]) > abs(second[0, 3]))
     if axis:
         views = [np.ascontiguousarray(view.transpose(1, 0, 2)) for view in views]
@@ -240,19 +249,20 @@ def _halves(sparse: SparseModel) -> list[SparseModel]:
 
 
 def read_ply_points(path: Path) -> np.ndarray:
-    """Read the finite (N, 3) float64 points of a PLY file that any program has written.
+    """Read the points of a PLY file from any program, (N, 3) float64, without non-finite ones.
 
-    It uses plyfile, because files of OpenMVS contain lists, on which the readers of OpenCV, COLMAP
-    and trimesh fail. An InvalidFileError is raised for other files.
+    The package plyfile reads them, because files from OpenMVS contain lists, on which the readers
+    of OpenCV, COLMAP and trimesh fail. An InvalidFileError is raised for other files.
     """
     try:
         head, end, rest = path.read_bytes().partition(b"end_header")
-        head = head.decode("ascii", "replace").encode("ascii", "replace")  # comments may be odd
+        # plyfile accepts only ASCII in the header, but comments may contain other characters.
+        head = head.decode("ascii", "replace").encode("ascii", "replace")
         vertices = plyfile.PlyData.read(BytesIO(head + end + rest))["vertex"]
         points = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except (plyfile.PlyParseError, OSError, KeyError, ValueError, MemoryError) as error:
         reason = first_line(error) or type(error).__name__
-        raise InvalidFileError(f"{path} is no PLY file of points ({reason}): check it") from error
+        raise InvalidFileError(f"{path} is not a PLY point cloud ({reason}): check it") from error
     return points[np.isfinite(points).all(axis=1)]

@@ -1,6 +1,7 @@
 """Compare guided matching with matching by descriptors alone and with chance.
 
-Guided matching finds more matches for any points, so counts only mean something next to chance.
+Guided matching finds many correct matches even for random points. So counts for a detector only
+mean something in comparison with the counts for random points.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from ..run import Run
 from .paper import CORRECT_PX, PAPER_MATCHING
 
 SEEDS = 3
-"""Guided matching runs with several seeds, because its random choices change the counts."""
+"""Guided matching runs with this number of seeds, because its random choices change the counts."""
 
 COLUMNS = {
     "pair": "",
@@ -47,13 +48,14 @@ COLUMNS = {
 
 NOTE = (
     f"Correct: matches with an error under {CORRECT_PX:g} px by the true homography; each point of "
-    "the first image counts once. Matchable: points of the first image whose true position has a "
-    "point of the second image within this distance. Unique: correct matches, where each point of "
-    f"the second image counts once. Guided: the run with the median count of {SEEDS} seeds (the "
-    "lower of two). ±: standard deviation of the counts. Lowest: the smallest count as a fraction "
-    "of the matchable points. Without a trusted geometry a seed has no matches, as in "
-    "match_images. Corner error: median over the seeds guided by a homography. Seconds: median "
-    "time of guided matching alone, when it was computed."
+    "the first image counts once. Matchable: points of the first image that the true homography "
+    "maps to within this distance of a point of the second image. Guided: guided matching runs "
+    f"with {SEEDS} seeds, and the columns show the run with the median number of correct matches. "
+    '±: standard deviation of this number over the seeds. "Of the matchable": number of correct '
+    "matches divided by that of matchable points; lowest: the smallest such fraction of a seed. "
+    "Unique: correct matches, where each point of the second image counts once. A seed that finds "
+    "no trusted geometry has no matches, as in match_images. Corner error: median over the seeds "
+    "that a homography guided. Seconds: median time of guided matching without finding keypoints."
 )
 
 
@@ -64,9 +66,10 @@ def guided_sections(
     key: str,
     title: str,
 ) -> list[Section]:
-    """Match pairs by descriptors alone and with guidance.
+    """Match image pairs by descriptors alone and by guided matching, and tabulate both.
 
-    `truths` maps the name of each ground truth to the pairs with its homographies.
+    `truths` maps names of ground truths, for example "refined", to the same pairs in the same
+    order, each with the homographies of this ground truth.
     """
     if "guided" not in options.protocols:
         return []
@@ -94,14 +97,15 @@ def guided_sections(
     ]
     text = (
         "By descriptors alone: the paper's matching (SIFT of size 3, FLANN, ratio 0.99). Guided: "
-        "the default of `match_images`; the true homography is only used for evaluation. "
-        f"DeepDetect gets images resized to 480x480 as {options.channels.upper()}."
+        "guided matching, the default of `match_images`; the true homography is only used for "
+        "evaluation. "
+        f"DeepDetect gets {options.channels.upper()} images resized to 480x480."
     )
     return [Section(f"{title}, descriptors alone and guided", (text,), tables)]
 
 
 def guided_row(run: Run, feature: LocalFeature, by_truth: Mapping[str, PlanarPair]) -> Row:
-    """Return the cells of `COLUMNS` for a pair with each ground truth, by its name."""
+    """Match an image pair; return the cells of `COLUMNS` for each ground truth, by its name."""
     pair = next(iter(by_truth.values()))
     images = (pair.first, pair.second)
     alone = run.matches(feature, images, PAPER_MATCHING)
@@ -145,7 +149,7 @@ def _guided_cells(
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Name the models that guided the matching, and the number of guided runs if not all were."""
+    """Name the models that guided the seeds, and the number of guided seeds if not all were."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):
@@ -158,10 +162,11 @@ def _correct(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.n
 
 
 def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -> Row:
-    """Match a pair with guided matching, cached. The pair's true homography is not used.
+    """Match a pair by guided matching, or read the result from the cache.
 
-    Returns the "model" that guided the matching ("none" without matches), its "matrix", the matched
-    positions "points0" and "points1", (M, 2) each, and the "seconds" of guided matching alone.
+    The pair's true homography is not used. Returns the "model" of the geometry that guided the
+    matching ("none" if there are no matches), its "matrix", the matched positions "points0" and
+    "points1", (M, 2) each, and the "seconds" of guided matching, without finding keypoints.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0].xy for image in images)

@@ -1,4 +1,4 @@
-"""Compare heat maps with known masks, and with labels of images at several scales."""
+"""Compare heat maps with known masks of images, and with labels computed from scaled images."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from deepdetect.io.masks import load_mask
 from ...labels import LabelOptions, fuse, visibility_of
 
 EPSILON = 1e-7
-"""Probabilities are clipped to this distance from 0 and 1 for the logarithm. Float32 numbers just
-below 1 differ by 6e-8."""
+"""Probabilities are clipped to this distance from 0 and 1, because the loss takes their logarithm,
+which is infinite at 0. For comparison, float32 numbers just below 1 differ by 6e-8."""
 
 NUM_BINS = 20
-"""Number of equally wide bins of probability for the calibration error. Chosen by hand; not
-measured."""
+"""The calibration error sorts probabilities into this number of equally wide bins. Chosen by hand;
+not measured."""
 
 
 @dataclass(frozen=True)
 class MaskScore:
-    """How well heat maps fit the masks of images.
+    """How well heat maps agree with masks, over a set of images.
 
     Attributes:
         loss: binary cross-entropy per pixel (natural logarithm), mean over the images.
-        iou: intersection over union of the known mask and the heat map thresholded at 0.5, mean
-            over the images. It is 1 if both are empty.
+        iou: intersection over union of the mask and the heat map thresholded at 0.5, mean over the
+            images. It is 1 for an image in which both are empty.
         images: number of images.
-        calibration_error: expected calibration error (Naeini et al., 2015) over all pixels. It is
-            the mean over bins of the difference between probability and fraction of marked pixels.
-        density: keypoints per pixel at threshold 0.5.
-        label_density: fraction of pixels that the masks mark.
+        calibration_error: expected calibration error (Naeini et al., 2015) over all pixels: for
+            each bin of probabilities, the difference between the mean probability and the fraction
+            of pixels that the masks mark; the mean of these differences, weighted by pixels.
+        density: fraction of the pixels of the images with a probability over 0.5 (keypoints).
+        label_density: fraction of the pixels of the images that the masks mark.
     """
 
     loss: float
@@ -50,7 +51,7 @@ class MaskScore:
 
 
 def score_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
-    """Return the loss and the IoU of probabilities (H, W) compared with a bool mask (H, W)."""
+    """Return the loss and the IoU (see `MaskScore`) of (H, W) probabilities and an (H, W) mask."""
     probability = np.clip(heatmap.astype(np.float64), EPSILON, 1 - EPSILON)
     loss = -np.log(np.where(mask, probability, 1 - probability)).mean()
     predicted = heatmap > 0.5
@@ -60,11 +61,13 @@ def score_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
 
 
 Measured = tuple[float, float, np.ndarray]
-"""Loss, IoU, and sums by bin, (4, 20): pixels, probabilities, marked pixels, predicted pixels."""
+"""Measurements of an image: loss, IoU, and a (4, 20) array with a column for each bin of
+probabilities. Its rows are the number of pixels in the bin, the sum of their probabilities, the
+number of pixels that the mask marks, and the number with a probability over 0.5."""
 
 
 def measure_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> Measured:
-    """Measure one image for `mean_score`."""
+    """Compare an (H, W) heat map with an (H, W) bool mask; `mean_score` combines the results."""
     probability = heatmap.astype(np.float64).ravel()
     bins = np.minimum((probability * NUM_BINS).astype(np.int64), NUM_BINS - 1)
     values = np.ones(len(bins)), probability, mask.ravel(), heatmap.ravel() > 0.5
@@ -73,7 +76,7 @@ def measure_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> Measured:
 
 
 def mean_score(measured: Sequence[Measured]) -> MaskScore:
-    """Return the score of images. Loss and IoU are means over images, other values over pixels."""
+    """Combine the measurements of images: loss and IoU by images, all other values by pixels."""
     loss = sum(loss for loss, _, _ in measured) / len(measured)
     iou = sum(iou for _, iou, _ in measured) / len(measured)
     pixels, probabilities, marked, predicted = np.sum([sums for *_, sums in measured], axis=0)
@@ -84,25 +87,26 @@ def mean_score(measured: Sequence[Measured]) -> MaskScore:
 
 
 CERTAIN_LOGIT = 200.0
-"""Logit whose probability is exactly 1 in float32. The probability of its negative is 0."""
+"""The probability of this logit is exactly 1 in float32, and that of the negative logit is 0."""
 
 
 def sample_images(folder: str | Path) -> list[Path]:
-    """List the images of a folder of samples `image_*.png` with masks `mask_image_*.png`.
+    """List the images `image_*.png` in a folder that also holds their masks `mask_image_*.png`.
 
     Raises:
-        ImageError: the folder has no samples.
+        ImageError: there are no such images.
     """
     images = sorted(Path(folder).glob("image_*.png"))
     if not images:
         raise ImageError(
-            f"there are no samples in {folder}: it must hold image_NAME.png and mask_image_NAME.png"
+            f"there are no images with masks in {folder}: "
+            "it must hold files image_NAME.png and mask_image_NAME.png"
         )
     return images
 
 
 def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Load the image of a sample, (H, W, 3) uint8 RGB, and its known mask, (H, W) bool.
+    """Load an image, (H, W, 3) uint8 RGB, and the mask beside it, (H, W) bool.
 
     Raises:
         ImageError: a file is missing or damaged, or the mask has another size.
@@ -110,21 +114,21 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
     rgb = load_image(path)
     mask = load_mask(path.with_name(f"mask_{path.name}"))
     if mask.shape != rgb.shape[:2]:
-        raise ImageError(f"the mask of {path} differs from the image in size")
+        raise ImageError(f"the image {path} and its mask differ in size")
     return rgb, mask
 
 
 def score_samples(
     heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, MaskScore]:
-    """Score a function from images to heat maps on samples of `load_sample`, by visibility."""
+    """Score a function from RGB images to heat maps on images with masks, for each visibility."""
     return _by_visibility(
         (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
     )
 
 
 def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScore]:
-    """Score images by visibility, "normal" or "low", without a visibility that has no images."""
+    """Combine measured images to a score for each visibility, "normal" or "low", that occurs."""
     measured: dict[str, list[Measured]] = {"normal": [], "low": []}
     for visibility, one in images:
         measured[visibility].append(one)
@@ -132,21 +136,22 @@ def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScor
 
 
 def check_scale(image: np.ndarray, scale: float, name: str = "an image") -> None:
-    """Raise an ImageError if scaling leaves a side of under 16 pixels."""
+    """Raise an ImageError if the image scaled by this factor has a side of under 16 pixels."""
     if (side := round(scale * min(image.shape[:2]))) < MINIMUM_SIDE:
         raise ImageError(
-            f"{name} scaled by {scale:g} has a side of {side} pixels: "
-            f"it needs at least {MINIMUM_SIDE}, use larger scales"
+            f"{name} scaled by {scale:g} has a side of {side} pixels, "
+            f"but at least {MINIMUM_SIDE} are needed: use larger scales"
         )
 
 
 def score_at_scale(
     detector: DeepDetect, images: Iterable[np.ndarray], scale: float
 ) -> dict[str, MaskScore]:
-    """Score weights on scaled (H, W, 3) images by labels made from the scaled images.
+    """Scale (H, W, 3) images; score the weights by fusion labels computed from the scaled images.
 
-    Images are processed at their scaled size. They are downscaled by area averaging and upscaled by
-    cubic interpolation. The visibility of an image selects how it is labelled.
+    The network processes images at their scaled size. Images are downscaled by area averaging and
+    upscaled by cubic interpolation. Returns a score for each visibility of images, "normal" and
+    "low"; images of low visibility are labelled with other settings.
 
     Raises:
         ImageError: a scaled image has a side of under 16 pixels.
@@ -164,11 +169,11 @@ def score_at_scale(
 
 
 class LabelDetector:
-    """A detector whose keypoints are the fusion label itself, without a network.
+    """A detector without a network, whose keypoints are the pixels that the fusion label marks.
 
-    It scores like weights without any error, so weights that score higher do so because of their
-    errors. The label is computed from the network's input if heat-map options are given, otherwise
-    from the image.
+    It behaves like weights that predict the label perfectly. If real weights score higher, they do
+    so because they deviate from the label. With heat-map options the label is computed from the
+    resized image that a network would get, otherwise from the original image.
     """
 
     def __init__(
@@ -178,7 +183,7 @@ class LabelDetector:
         self.heatmap_options = heatmap_options
 
     def heatmap(self, image: Any) -> np.ndarray:
-        """Return the label as (H, W) float32, 0 or 1."""
+        """Return the label as an (H, W) float32 map, 1 where it marks a pixel, otherwise 0."""
         rgb = load_image(image)
         if self.heatmap_options is not None:
             maps = compute_maps(rgb, self._network, self.heatmap_options)
@@ -193,10 +198,10 @@ class LabelDetector:
 
 
 class LabelDensityDetector:
-    """A detector that takes the most probable pixels of each image, as many as the label marks.
+    """A detector that takes the most probable pixels, as many as the image's fusion label marks.
 
-    Weights that mark more pixels get a higher repeatability and more matches for this reason alone.
-    This detector compares weights at equal numbers of keypoints.
+    Weights that mark more pixels have a higher repeatability and more matches for this reason
+    alone. With this detector, different weights are compared at equal numbers of keypoints.
     """
 
     def __init__(self, detector: DeepDetect) -> None:
@@ -210,6 +215,6 @@ class LabelDensityDetector:
         count = int(np.count_nonzero(self.labels.heatmap(rgb) > 0.5))
         heatmap, logits = self.detector.heatmap_and_logits(rgb)
         taken = np.zeros(heatmap.size, np.float32)
-        # Ties are broken by the order of rows.
+        # If pixels have equal logits, those in upper rows are taken first.
         taken[np.argsort(-logits.ravel(), kind="stable")[:count]] = 1
         return taken.reshape(heatmap.shape)

@@ -1,4 +1,4 @@
-"""The paper's protocol: density, foreground, repeatability and correct matches."""
+"""The paper's protocol: density, share on the foreground, repeatability and correct matches."""
 
 from __future__ import annotations
 
@@ -42,32 +42,35 @@ OXFORD_PAIRS = (
     *(("graf", 6), ("wall", 6), ("bikes", 6), ("leuven", 6), ("trees", 6), ("ubc", 6)),
     ("boat", 2),
 )
-"""The pairs of the paper's Table II: scene and number of the second image."""
+"""The image pairs of the paper's Table II: the scene and the number of the second image. The first
+image always has number 1."""
 
 CORRECT_PX = 1.0
-"""A match is correct if its error by the true homography is strictly below this."""
+"""A match is correct if its transfer error under the true homography is strictly below this."""
 
 PAPER_MATCHING = MatchSettings(matcher="flann", ratio=0.99)
 
 SEEDS = 3
-"""Counts are averaged over this number of FLANN seeds, because FLANN's random trees change them by
-some per cent."""
+"""Numbers of matches are averaged over this number of FLANN seeds, because FLANN's random trees
+change them by some per cent."""
 
 FEW_MATCHES = 1000
 MANY_SEEDS = 64
-"""Pairs with less than the first number of correct matches use the second number of seeds, because
-counts of about 100 (graf) vary by a tenth."""
+"""Image pairs with fewer than `FEW_MATCHES` correct matches are averaged over `MANY_SEEDS` FLANN
+seeds instead of `SEEDS`, because numbers of about 100 (graf) vary by a tenth between seeds."""
 
 REPEATABILITY_NOTE = (
-    "Number of points of the first image that map to less than 1 px from a point of the second, "
-    "divided by the smaller number of points, clipped at 1. It grows with the density, as the "
-    "baselines show."
+    "Repeatability: number of keypoints of the first image that the true homography maps to less "
+    "than 1 px from any keypoint of the second, divided by the number of keypoints in the image "
+    "that has fewer; at most 1. Detectors with more keypoints get higher values, even if the "
+    "keypoints are random, as the baselines show."
 )
 
 MATCHES_NOTE = (
-    "FLANN (5 trees, 50 checks), ratio 0.99. Correct: error strictly under 1 px by the homography "
-    "in the file. Binary descriptors (ORB, BRISK) are matched exactly by Hamming distance. The "
-    "number grows with the number of points of any kind, as the baselines show."
+    "Descriptors are matched by FLANN (5 trees, 50 checks) with ratio 0.99, binary ones (ORB, "
+    "BRISK) exactly by Hamming distance. Correct: matches with an error strictly under 1 px by the "
+    "published homography. Detectors with more keypoints get more correct matches, even if the "
+    "keypoints are random, as the baselines show."
 )
 
 
@@ -80,7 +83,8 @@ def density_table(
 ) -> Table:
     """Tabulate the keypoints per pixel: the mean over all images, and the mean of each scene.
 
-    The paper's numbers are next to the mean without the scene that the paper leaves out.
+    If `with_paper`, the table also has the mean without the scene `NOT_IN_DENSITY`, and next to it
+    the numbers of the paper, which leaves out this scene.
     """
 
     def measure(feature: LocalFeature, item: tuple[str, Path]) -> Row:
@@ -98,7 +102,7 @@ def density_table(
         **({title: (".4f", without)} if with_paper else {}),
         **{scene.name: average(".4f", "density", scene=scene.name) for scene in scenes},
     }
-    note = "The mean is over all images. Keypoints at the same pixel all count."
+    note = "The mean is over all images. Several keypoints at the same pixel all count."
     if with_paper:
         note += f" The paper's means leave out {NOT_IN_DENSITY}."
     table = tabulate(key, "Keypoints per pixel", features, rows, columns, note)
@@ -108,7 +112,7 @@ def density_table(
 def repeatability_table(
     run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene], key: str
 ) -> Table:
-    """Tabulate the paper's repeatability at 1 px: the mean over scenes, and each scene."""
+    """Tabulate the repeatability at 1 px as the paper defines it, by scene and as their mean."""
 
     def over_scenes(own: Rows) -> Cell:
         return mean_of(mean(where(own, scene=s.name), "repeatability") for s in scenes)
@@ -125,7 +129,7 @@ def repeatability_table(
 def repeatability_rows(
     run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene]
 ) -> Rows:
-    """Measure the paper's "repeatability" of all pairs; rows also hold the "scene"."""
+    """Measure the paper's repeatability of each pair; rows hold "repeatability" and "scene"."""
 
     def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
         return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
@@ -141,7 +145,7 @@ def matches_table(
     key: str,
     title: str = "Correct matches",
 ) -> Table:
-    """Tabulate the number of correct matches (error under 1 px) and their fraction."""
+    """Tabulate for each pair the number of matches with an error under 1 px, and their fraction."""
 
     def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
         correct, matches = correct_matches(run, feature, pair)
@@ -160,7 +164,7 @@ def matches_table(
 
 
 def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Measure the fraction of keypoints on the foreground, the second half of Table I."""
+    """Run the benchmark on the foreground: the fraction of keypoints on it, as in Table I."""
     images = load_foreground(run.folder("foreground"))
     features = options.density_features()
     rows = foreground_rows(run, features, images)
@@ -182,8 +186,9 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
     }
     covered = {row["item"]: row["covered"] for row in rows}
     note = (
-        f"{len(covered)} images; their foreground covers {mean_of(covered.values()) or 0:.1%} of "
-        "the pixels, the value of random points. The paper used 18 unpublished images."
+        f"{len(covered)} images. Their foreground covers {mean_of(covered.values()) or 0:.1%} of "
+        "the pixels, so this fraction of random points would be on it. The paper used 18 images "
+        "that are not published."
     )
     table = tabulate("foreground", "Keypoints on the foreground", features, rows, columns, note)
     table = with_paper_column(table, title, FOREGROUND)
@@ -193,16 +198,18 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
 def foreground_rows(
     run: Run, features: Sequence[LocalFeature], images: Sequence[MaskedPhotograph]
 ) -> Rows:
-    """Measure the fraction of keypoints on the foreground (NaN without any) and their density.
+    """Measure each feature on each photograph with a foreground mask.
 
-    "covered" is the fraction of pixels on the foreground, the value of random keypoints.
+    Rows hold the "fraction" of keypoints on the foreground (NaN without keypoints), the "density"
+    in keypoints per pixel, and "covered", the fraction of pixels on the foreground. Random
+    keypoints would have a "fraction" equal to "covered".
     """
 
     def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:
         keypoints, _ = run.keypoints(feature, image.image)
         mask = load_mask(image.mask)
         if mask.shape[::-1] != keypoints.image_size:
-            raise ImageError(f"{image.mask.name} and its photograph differ in size")
+            raise ImageError(f"the mask {image.mask.name} and its photograph differ in size")
         fraction = foreground_fraction(keypoints.xy, mask)
         return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
 
@@ -210,7 +217,7 @@ def foreground_rows(
 
 
 def pair_repeatability(run: Run, feature: LocalFeature, pair: PlanarPair) -> float:
-    """Return the paper's repeatability of a pair."""
+    """Return the repeatability of a feature on a pair, as the paper defines it."""
     images = (pair.first, pair.second)
 
     def make() -> Row:
@@ -232,7 +239,10 @@ def correct_matches(
 
 
 def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> tuple[int, int]:
-    """Return both counts as rounded means over the seeds (`MANY_SEEDS` below `FEW_MATCHES`)."""
+    """Return the numbers of correct and of all matches, as rounded means over FLANN seeds.
+
+    If there are fewer than `FEW_MATCHES` correct ones, `MANY_SEEDS` seeds are used, else `SEEDS`.
+    """
     counts: list[tuple[int, int]] = []
     for seed in range(MANY_SEEDS):
         if seed == SEEDS and np.mean(counts, axis=0)[0] >= FEW_MATCHES:
@@ -243,7 +253,7 @@ def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> t
 
 
 def keypoint_figure(run: Run, features: Sequence[LocalFeature], scene: PlanarScene) -> Figure:
-    """Draw Figure 2: keypoints of SIFT, of SIFT with low settings, and of DeepDetect."""
+    """Draw the paper's Figure 2 for a scene: the keypoints of each feature in the first image."""
     image = scene.images[0]
     rgb = load_image(image)
     panels, counts = [], []
@@ -258,7 +268,7 @@ def keypoint_figure(run: Run, features: Sequence[LocalFeature], scene: PlanarSce
 
 
 def mask_figure(scene: PlanarScene) -> Figure:
-    """Draw Figure 4: the keypoint mask and the edge mask of an image, and their combination."""
+    """Draw the paper's Figure 4: an image, its keypoint mask, its edge mask, and both combined."""
     from ...labels import draw_label, fuse
 
     rgb = load_image(scene.images[0])
@@ -267,7 +277,7 @@ def mask_figure(scene: PlanarScene) -> Figure:
 
 
 def match_figure(run: Run, feature: LocalFeature, number: str, pair: PlanarPair) -> Figure:
-    """Draw Figure 6 or 7: a random sample of a pair's matches; correct ones are green."""
+    """Draw Figure 6 or 7 of the paper: a random sample of a pair's matches, correct ones green."""
     found = run.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
     correct = transfer_errors(found.points0, found.points1, pair.homography) < CORRECT_PX
     drawn = draw_matches(

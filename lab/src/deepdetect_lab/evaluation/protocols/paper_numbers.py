@@ -1,4 +1,4 @@
-"""Add the numbers printed in the paper (`paper_numbers.toml`) to our tables."""
+"""Add the numbers that are printed in the paper (in `paper_numbers.toml`) to our tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..report import Rows, Table
 DEEPDETECT = "DeepDetect, threshold 0.5"
 
 Paper = Mapping[str, Mapping[str, float]]
-"""Numbers by row title and column title."""
+"""Numbers of a table in the paper: a dict of rows by title, each a dict by column title."""
 
 NUMBERS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 
@@ -34,8 +34,8 @@ OXFORD_REPEATABILITY = _by_method("oxford_repeatability")
 HPATCHES_REPEATABILITY = _by_method("hpatches_repeatability")
 
 NOT_IN_DENSITY = "trees"
-"""The paper leaves this scene out of its densities. Without the scene our 14 densities of classical
-detectors equal the printed ones. With it twelve of them differ, by up to 11 %."""
+"""The paper's mean densities leave out this scene. Without it, our mean densities of 14 classical
+detectors equal the printed ones. With it, twelve of them differ, by up to 11 %."""
 
 
 def paper_title(title: str) -> str:
@@ -44,7 +44,7 @@ def paper_title(title: str) -> str:
 
 
 def with_paper_rows(table: Table, paper: Paper) -> Table:
-    """Insert the paper's numbers below each of our rows. Rows that only the paper has come last."""
+    """Insert the paper's numbers as rows below ours. Rows that only the paper has come last."""
     first, *titles = table.columns
     ours = [row[first] for row in table.rows]
     rows: Rows = []
@@ -59,7 +59,7 @@ def with_paper_rows(table: Table, paper: Paper) -> Table:
 
 
 def with_paper_column(table: Table, title: str, paper: Mapping[str, float]) -> Table:
-    """Insert a column of the paper's numbers, given by row title, next to the titled column."""
+    """Insert the paper's numbers, given by row title, as a column to the right of `title`."""
     columns: dict[str, str] = {}
     for name, style in table.columns.items():
         columns[name] = style

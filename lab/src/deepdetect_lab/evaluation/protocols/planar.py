@@ -1,4 +1,4 @@
-"""Benchmarks on image pairs with homographies: Oxford, HPatches, dust and smoke."""
+"""Benchmarks on image pairs with known homographies: Oxford, HPatches, and low visibility."""
 
 from __future__ import annotations
 
@@ -34,17 +34,18 @@ from .paper_numbers import (
 from .standard import standard_sections
 
 KEYPOINT_SCENES = ("graf", "bikes", "leuven")
-"""Scenes of the paper's Figure 2."""
+"""The paper's Figure 2 shows keypoints in these scenes of Oxford."""
 
 GUIDED_PAIRS = (*paper.OXFORD_PAIRS, ("boat", 6), ("bark", 6))
 
 FIGURE_7_SCENES = 4
-"""Number of scenes in Figure 7, half with changing light, half with changing viewpoint."""
+"""Number of HPatches scenes to draw for Figure 7, half with changing light, half with changing
+viewpoint."""
 
 TRUTHS = {
     "published": (
-        "Evaluated by the published homographies of the data set, for comparison with papers. "
-        "Their errors are up to 26 px in places, which limits the scores at 1 px."
+        "Evaluated by the homographies that the data set publishes, for comparison with papers. "
+        "In places they are wrong by up to 26 px, which limits all scores at 1 px."
     ),
     "refined": (
         "Evaluated by more accurate homographies, which `benchmarks/refine_oxford.py` estimates "
@@ -52,18 +53,21 @@ TRUTHS = {
     ),
 }
 
-NOTHING_MOVES = "The two images of a scene show no motion: the true homography is the identity."
+NOTHING_MOVES = "Nothing moves between the images of a scene: the true homography is the identity."
 
 
 def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Measure Tables I and II, Oxford in Table III, Figures 1, 2, 4, 6, and other protocols."""
+    """Run the chosen protocols on Oxford, for Tables I to III and Figures 1, 2, 4, 6 of the paper.
+
+    "refined" homographies are used as well, if their files exist.
+    """
     folder = run.folder("oxford")
     by_truth = {"published": load_oxford(folder), "refined": load_oxford(folder, "refined")}
     for truth, of_truth in by_truth.items():
         by_truth[truth] = [scene.with_max_pairs(options.max_pairs) for scene in of_truth]
     scenes = by_truth["published"]
     if missing := [name for name in OXFORD_KINDS if name not in {scene.name for scene in scenes}]:
-        run.skipped.append(f"Oxford's {', '.join(missing)}: not in {folder}")
+        run.skipped.append(f"Oxford's {', '.join(missing)}: there is no such scene in {folder}")
     pairs = pairs_of(scenes)
     unrefined = [
         pair.name
@@ -75,8 +79,8 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
         del by_truth["refined"]
     if unrefined and {*options.protocols} - {"paper"}:
         run.skipped.append(
-            f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined "
-            "(run benchmarks/refine_oxford.py); these scenes are evaluated by the published ones"
+            f"refined homographies of {', '.join(unrefined)}: there are no files H1toKp.refined "
+            "(run benchmarks/refine_oxford.py); published homographies are used for these pairs"
         )
     sections = _oxford_paper(run, options, scenes)
     for truth, of_truth in by_truth.items():
@@ -84,7 +88,7 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
         sections += standard_sections(run, options, pairs_of(of_truth), key, title, TRUTHS[truth])
     chosen = {t: select_pairs(by_truth[t], GUIDED_PAIRS) for t in reversed(by_truth)}
     sections += guided_sections(run, options, chosen, "oxford", "Oxford")
-    # The last ground truth is the most accurate.
+    # `of_truth` and `title` are those of the last ground truth, which is the most accurate one.
     return sections + degraded_sections(run, options, pairs_of(of_truth), "oxford", title)
 
 
@@ -102,9 +106,9 @@ def _oxford_paper(
     drawn = [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
     figure_6, figures = _figures(run, options, figure_6_pairs, "oxford", drawn)
     text = (
-        "Tables I and II, the Oxford half of Table III, Figures 1, 2, 4 and 6. DeepDetect gets "
-        f"images resized to 480x480 as {options.channels.upper()}; the classical detectors get "
-        "original images. The paper's numbers are next to ours."
+        "Tables I and II of the paper, the Oxford half of Table III, and Figures 1, 2, 4 and 6, "
+        f"with the paper's numbers next to ours. DeepDetect gets {options.channels.upper()} images "
+        "resized to 480x480; the classical detectors get the original images."
     )
     tables = [
         density,
@@ -144,13 +148,16 @@ def _figures(
 def _drawn(
     run: Run, what: str, draw: Callable[[Any], Figure], items: Sequence[PlanarPair | PlanarScene]
 ) -> list[Figure]:
-    """Draw each item; if an item cannot be drawn, record the reason."""
+    """Draw a figure of each item. If one cannot be drawn, record the reason and leave it out."""
     figures = [run.attempt(f"{what} of {item.name}", draw, item) for item in items]
     return [figure for figure in figures if figure is not None]
 
 
 def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Measure Table III, Figure 7, and other protocols on 116 scenes and the D2-Net subset."""
+    """Run the chosen protocols on HPatches, for the paper's Table III and Figure 7.
+
+    The standard protocol is run on all scenes, and also on the subset that D2-Net's paper uses.
+    """
     found = load_hpatches(run.folder("hpatches"))
     scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]
     last = [scene.pairs[-1] for scene in scenes]
@@ -161,7 +168,7 @@ def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
     sections = _hpatches_paper(run, options, scenes, last)
     for name, chosen in subsets.items():
         key, title = f"hpatches_{len(chosen)}", f"HPatches, {name}"
-        text = "Evaluated by the homographies of the data set."
+        text = "Evaluated by the homographies that the data set publishes."
         sections += standard_sections(run, options, pairs_of(chosen), key, title, text)
     sections += guided_sections(run, options, {"published": last}, "hpatches", "HPatches")
     return sections + degraded_sections(run, options, pairs_of(scenes), "hpatches", "HPatches")
@@ -178,8 +185,9 @@ def _hpatches_paper(
     of_kind = [[pair for pair in last if light[pair.scene] is kind] for kind in (True, False)]
     drawn = [pair for pairs in of_kind for pair in pairs[: FIGURE_7_SCENES // 2]]
     text = (
-        f"{len(scenes)} of the 116 scenes of the data set. Images 1 and 6 are matched. The largest "
-        f"number of correct matches of a pair in the paper is {NUMBERS['max_matches']:,}."
+        f"Measured on {len(scenes)} of the 116 scenes of the data set. Matches are those between "
+        "images 1 and 6 of each scene. The largest number of correct matches of a pair that the "
+        f"paper reports is {NUMBERS['max_matches']:,}."
     )
     tables = [
         table_3(repeatability, light),
@@ -193,7 +201,10 @@ def _hpatches_paper(
 
 
 def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
-    """Average the repeatability by kind of scene; `light` marks scenes with changing light."""
+    """Average the repeatability of scenes with changing light and of those with changing viewpoint.
+
+    `by_scene` has a column for each scene. `light` maps a scene to True if its light changes.
+    """
     titles = {}
     rows: Rows = [{"method": row["method"]} for row in by_scene.rows]
     for kind, wanted in (("illumination", True), ("viewpoint", False)):
@@ -207,7 +218,8 @@ def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
         "Table III: repeatability as in the paper, by kind of scene",
         {"method": "", **dict.fromkeys(titles.values(), ".4f")},
         rows,
-        f"{by_scene.note} The paper used 57 and 59 scenes.",
+        f"{by_scene.note} The paper used 57 scenes with changing illumination and 59 with changing "
+        "viewpoint.",
     )
     numbers = {
         title: {titles[kind]: value for kind, value in of_method.items()}
@@ -217,7 +229,7 @@ def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
 
 
 def low_visibility(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the protocols on the pairs with dust and with smoke (Figure 6)."""
+    """Run the chosen protocols on the pairs in which dust or smoke hides the scene (Figure 6)."""
     scenes = load_low_visibility(run.folder("low-visibility"))
     pairs = pairs_of(scenes)
     key, title = "low_visibility", "Low visibility"
@@ -245,6 +257,6 @@ def pairs_of(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:
 def select_pairs(
     scenes: Sequence[PlanarScene], chosen: Sequence[tuple[str, int]]
 ) -> list[PlanarPair]:
-    """Return the pairs with given scenes and numbers that exist, for example those of Table II."""
+    """Return the chosen pairs, given as (scene, number of the second image), that exist."""
     found = {(pair.scene, pair.number): pair for pair in pairs_of(scenes)}
     return [found[name] for name in chosen if name in found]

@@ -1,4 +1,4 @@
-"""Evaluate relative poses from matches in images with known cameras."""
+"""Evaluate relative poses that are estimated from matches, in image pairs with known cameras."""
 
 from __future__ import annotations
 
@@ -44,17 +44,18 @@ from ..unguided import UPRIGHT_SIFT, match_unguided
 THRESHOLD_PX = 1.0
 CONFIDENCE = 0.99999
 MIN_MATCHES = 6
-"""Five matches always fit an essential matrix exactly, so at least one more is needed."""
+"""Any five matches fit some essential matrix exactly, so at least one more is needed."""
 
 NO_FAR_POINTS = 1e9
-"""Points farther away than this, in baselines, do not count when OpenCV chooses one of four poses.
-The value is so large that all points count."""
+"""An essential matrix allows four poses. OpenCV chooses the one with most points in front of both
+cameras, but leaves out points farther away than this number of baselines. The value is so large
+that all points count."""
 
 BUDGET = 8192
 RATIO = 0.8
 GOOD_DEG = 5.0
-"""A pose with an error below this, in degrees, counts as correct when methods are compared by
-pair."""
+"""When a method is compared with SIFT pair by pair, a pose counts as correct if its error is below
+this number of degrees."""
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
@@ -63,37 +64,41 @@ AGREEING = f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px"
 
 TEXT = (
     "The relative pose of two cameras is estimated from matches in the same way for all methods: "
-    f"by OpenCV's MAGSAC at {THRESHOLD_PX:g} px with the true intrinsics (confidence "
-    f"{CONFIDENCE:g}). Among the four possible poses, the one with most points in front of both "
-    "cameras is used. The error is the larger of rotation error and translation error (angles). "
-    "DeepDetect: `match_images` with its defaults (guided), and by descriptors alone (patchmatch, "
-    f"mutual nearest neighbours). Further methods: the best {BUDGET:,} keypoints, exact mutual "
-    f"nearest neighbours, ratio {RATIO:g} (none for learned descriptors).",
+    f"OpenCV's MAGSAC with a threshold of {THRESHOLD_PX:g} px and a confidence of {CONFIDENCE:g} "
+    "estimates the essential matrix with the true intrinsics. It allows four poses, and the one "
+    "with most points in front of both cameras is used. The error of a pose is the larger of two "
+    "angles, the rotation error and the translation error. Methods differ in the matches. "
+    '"DeepDetect": `match_images` with its defaults, which is guided matching. "DeepDetect, '
+    'unguided": keypoints are matched by descriptors alone (patchmatch, mutual nearest '
+    f"neighbours). All others: the best {BUDGET:,} keypoints are matched by exact mutual nearest "
+    f"neighbours with ratio {RATIO:g}, or without ratio test if descriptors are learned.",
     f'"{STRAIGHT_AHEAD}" uses no image. It assumes no rotation, and the second camera in front of '
-    "the first. In a clip from a moving car this is a strong guess.",
-    "The thresholds by which guided matching chooses between plane and depth were chosen on "
-    "Strecha's fountain and a KITTI clip, so results on these do not test that choice.",
+    "the first. For images from a moving car this guess is often nearly correct.",
+    "Guided matching decides by thresholds whether a scene is a plane or has depth. These were "
+    "chosen on Strecha's fountain and a KITTI clip, so results on these two do not test them.",
 )
 
 NOTE = (
-    "Failed: pairs without a pose; their error is infinite. AUC: area under the cumulative error "
-    "curve up to a threshold, as in SuperGlue and glue-factory, except that an opposite "
-    "translation is wrong here. Matches: median. Agreeing: fraction of the matches whose Sampson "
-    f"distance from the true epipolar geometry is under {EPIPOLAR_THRESHOLD_PX:g} px, mean over "
-    "the pairs; a pair without matches counts as 0."
+    "Failed: number of pairs for which no pose was found; their error counts as infinite. AUC: "
+    "area under the cumulative error curve up to a threshold, as in SuperGlue and glue-factory, "
+    "except that a translation in the opposite direction is wrong here. Matches: median over the "
+    "pairs. Agreeing: fraction of the matches whose Sampson distance from the true epipolar "
+    f"geometry is under {EPIPOLAR_THRESHOLD_PX:g} px, mean over the pairs; a pair without matches "
+    "counts as 0."
 )
 
 Found = tuple[np.ndarray, np.ndarray, float, str]
-"""The matched positions of both images, (M, 2) each, the seconds, and the model that guided the
-matching: "homography", "fundamental" or "none", or "" for methods without guidance."""
+"""The matches of two images: their positions in the first and in the second image, (M, 2) each; the
+seconds that matching took; and the model that guided it, "homography", "fundamental" or "none". The
+model is "" for methods without guidance."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMethod:
-    """A row of the tables.
+    """A method that the benchmark compares, with its title in the tables.
 
-    `match` finds the matches of two images. With None the pose is always straight ahead. `name` and
-    `version` identify the results in the cache.
+    `match` finds the matches of two images. If it is None, the method guesses without images that
+    the camera moves straight ahead. `name` and `version` identify the results in the cache.
     """
 
     name: str
@@ -103,7 +108,7 @@ class PoseMethod:
 
 
 def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Estimate the poses of all pairs of all scenes by all methods."""
+    """Run the benchmark: estimate the relative pose of each pair of each scene by each method."""
     scenes = load_posed_scenes(run.folder("pose"), options.max_pairs)
     methods = pose_methods(run, options)
     items = {
@@ -120,7 +125,7 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def pose_methods(run: Run, options: BenchmarkOptions) -> list[PoseMethod]:
-    """Return DeepDetect's methods, the chosen baselines, and the guess without images."""
+    """Return the methods of DeepDetect, the chosen baselines, and the guess without images."""
     detector, own = options.native_detector(), options.deepdetect_native()
     ways = {"DeepDetect": _match_guided, "DeepDetect, unguided": _match_unguided}
     chosen = {"sift": CLASSICAL["sift"], "orb": STANDARD["orb"]}
@@ -150,7 +155,7 @@ def _match_unguided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
 
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
-    """Make a method with exact matching and a ratio test (none for learned descriptors)."""
+    """Make a method that matches descriptors exactly, with a ratio test unless they are learned."""
     ratio, test = (math.inf, "no ratio test") if feature.learned else (RATIO, f"ratio {RATIO:g}")
     settings = MatchSettings("exact", ratio, mutual=True, budget=BUDGET)
 
@@ -165,9 +170,10 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
 
 
 def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
-    """Measure a method on a pair, cached; return the values by column title.
+    """Measure a method on a pair, or read the result from the cache; return values by column title.
 
-    Errors are in degrees and infinite without a pose. The guess without images has only errors.
+    Errors are in degrees, and infinite if no pose was found. The guess without images has errors
+    but no other values.
     """
     match = method.match
     images = (pair.first.path, pair.second.path)
@@ -194,7 +200,7 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
 
 
 def pose_errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
-    """Return the errors of a pose in degrees by column title, infinite without a pose."""
+    """Return the errors of a pose in degrees by column title. They are infinite without a pose."""
     rotation = translation = float("inf")
     if pose is not None:
         rotation = rotation_error(pose[0], pair.rotation)
@@ -208,13 +214,15 @@ def estimate_pose(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Estimate the relative pose of two cameras from (M, 2) matches; return None on failure.
 
-    Returns the (3, 3) rotation and (3,) translation of length 1: X1 = rotation @ X0 + translation.
+    Returns the (3, 3) rotation and the (3,) translation, which has length 1. They map a point from
+    the first camera's coordinates to the second's: X1 = rotation @ X0 + translation.
     """
     if len(points0) < MIN_MATCHES:
         return None
-    # Both images are mapped to a common camera, so their intrinsics may differ. It has the mean
-    # focal length, because OpenCV 5's MAGSAC is less accurate in normalised coordinates (SIFT on 87
-    # pairs of a KITTI clip: median rotation error 0.13 instead of 0.05 degrees).
+    # The intrinsics of the images may differ, so positions are mapped to one camera for both. Its
+    # focal length is the mean of both and not 1, because OpenCV 5's MAGSAC is less accurate in
+    # normalised coordinates (SIFT on 87 pairs of a KITTI clip: median rotation error 0.13 instead
+    # of 0.05 degrees).
     focal = float(np.mean([k[i, i] for k in (intrinsics0, intrinsics1) for i in (0, 1)]))
     camera = np.diag([focal, focal, 1.0])
     first = _of_camera(points0, intrinsics0, camera)
@@ -228,13 +236,13 @@ def estimate_pose(
         _, rotation, translation, *_ = cv2.recoverPose(
             essential, first, second, camera, distanceThresh=NO_FAR_POINTS, mask=inliers
         )
-    except cv2.error:  # degenerate input, for example all points at one place
+    except cv2.error:  # the matches are degenerate, for example all at one place
         return None
     return rotation, translation.ravel()
 
 
 def _of_camera(points: np.ndarray, intrinsics: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Map pixel positions to those in another camera with the same pose."""
+    """Map positions from an image with these intrinsics to another camera with the same pose."""
     homogeneous = np.column_stack([np.asarray(points, np.float64), np.ones(len(points))])
     return np.ascontiguousarray((homogeneous @ (camera @ np.linalg.inv(intrinsics)).T)[:, :2])
 
@@ -257,7 +265,7 @@ SUMMARY: Columns = {
 
 
 def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], rows: Rows) -> Table:
-    """Tabulate each method on each scene, with the pairs better and worse than SIFT."""
+    """Tabulate each method on each scene, with the numbers of pairs better and worse than SIFT."""
     sift = {row["item"]: row[ERROR] < GOOD_DEG for row in where(rows, method="sift")}
 
     def against_sift(own: Rows, only_sift: bool) -> int | None:
@@ -279,9 +287,10 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         "seconds": median(".2f", "seconds"),
     }
     note = (
-        f"{NOTE} Guided by: number of pairs guided by this geometry. Worse than SIFT: pairs with "
-        f"an error of {GOOD_DEG:g}° or more for which SIFT's error is smaller than {GOOD_DEG:g}°; "
-        "better: the reverse. Seconds: median time from images to matches, when it was computed."
+        f"{NOTE} Guided by: number of pairs whose matching a homography or a fundamental matrix "
+        "guided; unguided: pairs for which no geometry was trusted. Worse than SIFT: number of "
+        f"pairs with an error of {GOOD_DEG:g}° or more, while SIFT's is under {GOOD_DEG:g}°; "
+        "better: the reverse. Seconds: median time from images to matches."
     )
     groups = [{"scene": scene.name} for scene in scenes]
     return tabulate("pose", "Relative poses", methods, rows, columns, note, groups)

@@ -1,8 +1,8 @@
-"""Evaluate structure from motion on scenes with known cameras: ranked points, SIFT, chance.
+"""Evaluate structure from motion on scenes with known cameras, with different keypoints.
 
-All methods use the stages of `reconstruct_many` with the same options. They only differ in the
-keypoints, and SIFT also in the matches. Each method runs in its own process, so that its memory can
-be measured.
+The methods are DeepDetect's ranked points, SIFT, and random points. All run the stages of
+`reconstruct_many` with the same options. They differ in the keypoints, some also in the matches or
+in how tracks are made. Each runs in its own process, so that its memory can be measured.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
 MIN_IMAGES = 3
 
 POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
-"""Thresholds of the AUC in degrees. They are below those for image pairs, since bundle-adjusted
-cameras are more accurate."""
+"""Thresholds in degrees of the AUC (area under the cumulative error curve). They are lower than in
+the benchmark on image pairs, since bundle-adjusted cameras are more accurate."""
 
 DATABASE = "sift.db"
 
 OPTIONS = MultiViewOptions(pairs="exhaustive")
-"""Options of all methods. They are the defaults of `reconstruct_many`, except that all pairs are
+"""Options for all methods: the defaults of `reconstruct_many`, except that all image pairs are
 matched."""
 
 KINDS = ("true", "estimated")
@@ -79,32 +79,37 @@ COST_COLUMNS = {
 }
 
 TEXT = (
-    "Cameras of all images and sparse points are reconstructed as by `reconstruct_many`: every "
-    "pair is matched, COLMAP verifies and maps, tracks are refined, and a last bundle adjustment "
-    "with a robust loss follows. All methods use the same stages and options, once with true and "
-    "once with estimated intrinsics; the true poses are only used for evaluation. The keypoints "
-    "differ: the ranked points of DeepDetect; as many random points with their sizes; and "
-    "pycolmap's SIFT with its own matcher, at no more positions, some of them with two angles. "
-    "SIFT runs once with unrefined and once with refined tracks. Dense tracks are those of "
-    "`--matches dense`. Where only GPS positions are known, camera centres are compared with them.",
+    "The cameras of all images and sparse points are reconstructed by the stages of "
+    "`reconstruct_many`: every image pair is matched, COLMAP verifies the matches and estimates "
+    "cameras and points, tracks are refined, and a last bundle adjustment with a robust loss "
+    "follows. All methods have the same options. They run once with true and once with estimated "
+    "intrinsics; the true poses are only used for evaluation. Methods differ in the keypoints: the "
+    "ranked points of DeepDetect; as many random points with the same sizes; and pycolmap's SIFT "
+    "with its own matcher, at no more positions, some of which have two angles. SIFT runs once "
+    'with and once without refinement of its tracks. "Dense tracks" uses the ranked points with '
+    "the option `--matches dense`. In scenes where only GPS positions are known, the camera "
+    "centres are compared with these.",
 )
 
 CAMERA_NOTE = (
-    "AUC: over the relative poses of all pairs of images. The error is the larger of rotation and "
-    "translation error (angles), and infinite if an image is not registered. Centres and "
-    "rotations: mean errors of the registered cameras after alignment of their centres. From the "
-    "first row's: mean distance of the centres from those of the first method. If it is much "
-    "smaller than the errors of both methods, the ground truth is inaccurate, or both methods "
-    "share an error. For cameras on a straight line the rotation about it is undetermined, so no "
-    "rotation error is given; use the AUC. Track length: mean number of images that see a point. "
-    "Reprojection error: mean over the method's own points; it does not measure the cameras."
+    "AUC: area under the cumulative error curve of the relative poses of all image pairs, up to "
+    "this threshold. The error of a pair is the larger of two angles, the rotation and the "
+    "translation error, or infinite if an image is not registered. Centres and rotations: mean "
+    "errors of the registered cameras after their centres are aligned with the true ones. From the "
+    "first row's: mean distance between the camera centres of this method and of the first method. "
+    "If this distance is much smaller than the errors of both methods, the ground truth is "
+    "inaccurate, or both methods make the same error. If all cameras are on a straight line, the "
+    "alignment leaves the rotation about the line undetermined, so no rotation error is given; use "
+    "the AUC. Track length: mean number of images that see a point. Reprojection error: mean over "
+    "the method's own points; it does not show how accurate the cameras are."
 )
 
 COST_NOTE = (
-    "Each method runs in its own process: keypoints, descriptors and matches on one thread, "
-    "verification and mapping on COLMAP's default number of threads. Memory: peak memory of the "
-    "process, with Python and all libraries. Random points replace ranked points, which add to "
-    "their memory but not to their seconds. On a busy machine, compare CPU seconds."
+    "Each method runs in its own process. Keypoints, descriptors and matches are computed on one "
+    "thread, verification and mapping on COLMAP's default number of threads. Memory: peak memory "
+    "of the process, including Python and all libraries. The method with random points first "
+    "computes the ranked points that it replaces. Their memory is included, their time is not. If "
+    "the machine was busy, compare CPU seconds."
 )
 
 
@@ -113,11 +118,12 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class SfmMethod:
-    """A row of the tables; `name` is the title, and `name` and `version` identify cached results.
+    """A method that the benchmark compares. `name` is its title in the tables.
 
-    `find` writes the keypoints of images into a folder, and `match` returns the matches of pairs.
-    Both are module-level functions. With `chance` the time of `find` is not reported. `refined`
-    says whether COLMAP's tracks are refined, and `tracks` is the option `matches`.
+    `find` writes the keypoints of a folder of images to a file, and `match` returns the matches of
+    image pairs. Both must be module-level functions, because another process runs them. `name` and
+    `version` identify cached results. If `chance` is set, the time of `find` is not reported. If
+    `refined` is set, COLMAP's tracks are refined. `tracks` is the value of the option `matches`.
     """
 
     name: str
@@ -131,7 +137,7 @@ class SfmMethod:
 
 @lru_cache
 def true_views(scene: PosedScene) -> dict[str, PosedView]:
-    """Return the true cameras and poses by file name."""
+    """Return the true camera and pose of each image, by file name."""
     views = {}
     for image in scene.images:
         name, matrix = image.path.name, image.intrinsics
@@ -143,18 +149,18 @@ def true_views(scene: PosedScene) -> dict[str, PosedView]:
 
 
 def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Reconstruct all scenes by all methods."""
+    """Run the benchmark: reconstruct each scene by each method, and measure dense points."""
     import_pycolmap()  # fails early if pycolmap is not installed
     folder = run.folder("sfm")
     scenes = load_posed_scenes(run.folder("pose") if folder == run.data else folder, located=True)
     chosen = {}
     for each in scenes:
         if len(each.images) < MIN_IMAGES:
-            run.fail(f"{each.name}: it has {len(each.images)} images, but 3 are needed")
+            run.fail(f"{each.name}: it has {len(each.images)} images, but at least 3 are needed")
         else:
             chosen[each.name] = choose_images(each, options.max_images)
     for feature in options.others:
-        run.skipped.append(f"sfm: {feature.title}: this benchmark does not run further methods")
+        run.skipped.append(f"sfm: {feature.title}: the benchmark sfm only runs its own methods")
     methods = sfm_methods(options)
     rows = run.rows("", methods, chosen, partial(measure_scene, run))
     rows = [row for name in chosen for row in where(rows, item=name)]
@@ -172,9 +178,10 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def choose_images(scene: PosedScene, most: int) -> PosedScene:
-    """Limit the images of a scene to the first ones of a sequence, or to evenly spaced ones.
+    """Return a scene with at most `most` images.
 
-    Evenly spaced frames of a long sequence would not overlap.
+    They are the first images of a sequence, because evenly spaced frames of a long sequence would
+    not overlap. In scenes of unordered images they are evenly spaced.
     """
     sequence = bool(scene.pairs) and scene.pairs[0].frame_distance is not None
     images = scene.images[:most] if sequence else evenly_spaced(scene.images, most)
@@ -182,7 +189,7 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
-    """Return two methods of ranked points, two of SIFT if it is a baseline, and chance."""
+    """Return two methods with ranked points, two with SIFT if chosen, and the chance baseline."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
     version, random = _version(points), "baseline: as many random points"
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
@@ -198,10 +205,11 @@ def _version(points: PointDetector) -> str:
 
 
 def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
-    """Reconstruct a scene by a method, cached.
+    """Reconstruct a scene by a method, or read the result from the cache.
 
-    Returns the values of `run_method`, the "scene", and for true and for estimated intrinsics the
-    registered "views" and the `MODEL_COLUMNS`.
+    Returns the values of `run_method` and the "scene". The keys "true" and "estimated" hold the
+    result with these intrinsics: a dict of the "views" (registered cameras by file name) and of the
+    `MODEL_COLUMNS`.
     """
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
@@ -225,7 +233,10 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
 
 
 def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
-    """Measure the dense points of a scene, cached."""
+    """Measure the dense points of a scene: a row for DeepDetect, and one for OpenCV's SGBM.
+
+    The values are read from the cache if they are there.
+    """
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
     known = {} if scene.located_only else cameras
@@ -244,7 +255,7 @@ def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
 
 
 def camera_table(rows: Rows) -> Table:
-    """Tabulate the cameras and sparse points of each method on each scene."""
+    """Tabulate the errors of cameras and the sparse points of each method on each scene."""
     lines = []
     for row in rows:
         scene: PosedScene = row["scene"]
@@ -280,7 +291,11 @@ Views = Mapping[str, PosedView]
 
 
 def _apart(views: Views, others: Views, truth: Views) -> float | None:
-    """Return the mean distance between camera centres of two models, in the ground truth's unit."""
+    """Align the camera centres of two models, and return their mean distance.
+
+    The distance is in the unit of the ground truth. It is None if the models share fewer than
+    three images.
+    """
     names = sorted(set(views) & set(others))
     if len(names) < MIN_IMAGES:
         return None
@@ -290,12 +305,12 @@ def _apart(views: Views, others: Views, truth: Views) -> float | None:
 
 
 def find_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
-    """Find the ranked points of the images in a folder, as `reconstruct_many` does."""
+    """Write the ranked points of all images in a folder to a file, as `reconstruct_many` does."""
     stages.extract(folder, detector)
 
 
 def find_random_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
-    """Replace ranked points by as many random points, with their sizes in random order."""
+    """Write as many random points as there are ranked points, with their sizes in random order."""
     find_points(detector, stages, folder)
     with import_h5py().File(stages.features, "r+") as file:
         for number, name in enumerate(sorted(path.name for path in folder.iterdir())):
@@ -314,7 +329,7 @@ def find_random_points(detector: PointDetector, stages: Stages, folder: Path) ->
 
 
 def find_sift(stages: Stages, folder: Path) -> None:
-    """Detect keypoints by pycolmap's SIFT with its defaults, at no more positions than ours."""
+    """Write keypoints of pycolmap's SIFT with its defaults, at up to `MAX_KEYPOINTS` positions."""
     names = sorted(path.name for path in folder.iterdir())
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureExtractionOptions()
@@ -337,7 +352,10 @@ def find_sift(stages: Stages, folder: Path) -> None:
 
 
 def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-    """Match by pycolmap's matcher with its defaults, with the verification of all methods."""
+    """Match SIFT keypoints by pycolmap's matcher with its defaults, without verification.
+
+    A later stage verifies the matches of all methods in the same way.
+    """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureMatchingOptions()
         how.num_threads = 1
@@ -359,8 +377,9 @@ def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
 def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, Camera]) -> Row:
     """Reconstruct images by a method. Call it in a separate process.
 
-    Returns the `COST_COLUMNS`, and the values of `_unpacked` with prefixes "true " and
-    "estimated ".
+    `cameras` are the true intrinsics by file name. Returns the `COST_COLUMNS` and the values of
+    `_unpacked`, once with the prefix "true " and once with the prefix "estimated ", for the
+    reconstructions with true and with estimated intrinsics.
     """
     with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
         options = replace(OPTIONS, matches=method.tracks)
@@ -388,7 +407,7 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
             model, seconds = None, np.nan
             if known or kind == "estimated":
                 cpu = time.process_time()
-                with contextlib.suppress(NoDepthError):  # no model is also a result
+                with contextlib.suppress(NoDepthError):  # a failed reconstruction is also a result
                     model = stages.map(folder, intrinsics, matches, bool(known), method.refined)[0]
                 seconds = time.process_time() - cpu
             row[MAPPING_CPU.format(kind)] = seconds
@@ -401,10 +420,10 @@ def _times() -> np.ndarray:
 
 
 def _unpacked(model: Any) -> Row:
-    """Return the results that are kept of a pycolmap model, or of None if there is no model.
+    """Return the values of a pycolmap model that are cached. The model may be None, if it failed.
 
-    They are the "names" and "poses" (rotation and translation, (N, 12)) of the registered images,
-    and the `MODEL_COLUMNS`.
+    They are the "names" of the N registered images, their "poses", (N, 12) with the 9 numbers of
+    the rotation and the 3 of the translation in a row, and the `MODEL_COLUMNS`.
     """
     columns: Row = {**dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
     if model is None:

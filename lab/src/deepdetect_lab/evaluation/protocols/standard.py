@@ -1,4 +1,4 @@
-"""Standard metrics on pairs with homographies, at equal keypoint budgets, with chance levels."""
+"""Standard metrics on pairs with homographies, at equal numbers of keypoints, and chance levels."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ from ..report import (
 from ..run import MatchSettings, Run
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
-"""Budgets, which are the numbers of best keypoints that are compared. None takes all keypoints."""
+"""Methods are compared at each of these budgets: the number of best keypoints that are taken from
+each image. None takes all keypoints."""
 
 RADII_PX = (1.0, 2.0, 3.0)
 SEEDS = 5
@@ -52,24 +53,25 @@ measured."""
 INLIER_THRESHOLD_PX = 3.0
 
 MIN_FILLED = 0.9
-"""Results at a budget are shown if a method finds at least this fraction of the budget on average,
-because otherwise numbers of keypoints would differ. Chosen by hand."""
+"""A result at a budget is only shown if the method finds, on average, at least this fraction of the
+budget, because otherwise the numbers of keypoints would differ between methods. Chosen by hand."""
 
 MAX_CHANCE = 0.95
-"""Chance correction is left out above this chance level, since it would divide by nearly 0."""
+"""Chance-corrected values are left out if the chance level is above this, since the correction
+divides by 1 minus the chance level."""
 
 MATCHING_NOTE = (
     f"The best {MATCHING_BUDGET:,} keypoints of each image are matched by mutual nearest "
-    f"neighbours with ratio {RATIO} (none for learned descriptors). All have the same upright "
-    "RootSIFT of size 4, except in rows that name others. Values are means over the pairs; without "
-    "matches the precision is 0."
+    f"neighbours with ratio {RATIO}, or without ratio test if descriptors are learned. All methods "
+    "have the same descriptor, upright RootSIFT of size 4, except in rows whose names say "
+    "otherwise. Values are means over the pairs; the precision of a pair without matches is 0."
 )
 
 
 def standard_sections(
     run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], *texts: str
 ) -> list[Section]:
-    """Return the section of `standard_section` if the protocol is requested."""
+    """Return the section of `standard_section` in a list, empty if "standard" is not requested."""
     wanted = "standard" in options.protocols
     return [standard_section(run, options, pairs, *texts)] if wanted else []
 
@@ -82,7 +84,7 @@ def standard_section(
     title: str,
     text: str,
 ) -> Section:
-    """Measure and show all features on all pairs."""
+    """Measure all features on all pairs; return a section of the report with the tables."""
     features = options.standard_features()
     rows = standard_rows(run, features, pairs)
     what = f"{title} ({len(pairs)} pairs)"
@@ -91,21 +93,24 @@ def standard_section(
 
 
 def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:
-    """Measure all features on all pairs: see `pair_row`."""
+    """Measure each feature on each pair; a row has the values of `pair_row`."""
     items = {pair.name: pair for pair in pairs}
     return run.rows("", features, items, lambda feature, pair: pair_row(run, feature, pair))
 
 
 def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
-    """Measure a feature on a pair.
+    """Measure a feature on an image pair.
 
     Returns:
-        Values by name. The "kind" is that of the pair. ("keypoints", budget) is the number in the
-        image that has fewer. ("repeated", budget, radius) is the repeatability. "chance" and
-        "localization" have the same indices. ("coverage", budget) is that of the first image.
-        "matches", ("correct", px), ("precision", px) and ("score", px) are those of
-        `match_accuracy`. "all matches" and ("accuracy", px) are without a ratio test. "corner
-        errors" are given by seed.
+        Values by name. "kind" is the kind of change in the pair. For each budget,
+        ("keypoints", budget) is the number of keypoints in the image that has fewer, and
+        ("coverage", budget) is the coverage of the first image. For each budget and radius, there
+        are the three values of `mutual_nn_repeatability`: ("repeated", budget, radius), the
+        repeatability; ("chance", budget, radius), its chance level; and
+        ("localization", budget, radius), the mean distance. "matches", ("correct", px),
+        ("precision", px) and ("score", px) are the values of `match_accuracy`. The number of
+        matches without a ratio test is "all matches", and their precision is ("accuracy", px).
+        "corner errors" is a list with the corner error for each seed of MAGSAC.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0] for image in images)
@@ -139,7 +144,7 @@ def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
         **{("accuracy", px): without_ratio["precision", px] for px in MATCH_THRESHOLDS_PX},
         "corner errors": run.cached("corner_errors", depends, corner_errors)["errors"].tolist(),
     }
-    # Each position counts once, although SIFT repeats some positions with other orientations.
+    # SIFT repeats some positions with other orientations. For repeatability each counts once.
     places = [first.distinct(), second.distinct()]
     for budget in BUDGETS:
         row |= _at_budget(run, feature, pair, places, budget)
@@ -173,9 +178,9 @@ def _at_budget(
 
 
 def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeated") -> float | None:
-    """Return the mean of a value of `pair_row`, by default the repeatability.
+    """Return the mean of a value of `pair_row` over the rows, by default of the repeatability.
 
-    It is None if the methods do not fill the budget.
+    It is None if there are fewer keypoints than `MIN_FILLED` times the budget on average.
     """
     filled = mean(rows, ("keypoints", budget))
     if filled is None or (budget is not None and filled < MIN_FILLED * budget):
@@ -184,7 +189,7 @@ def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeate
 
 
 def correct(rows: Rows) -> float | None:
-    """Return the mean number of correct matches at 1 px."""
+    """Return the mean number of matches with an error of at most 1 px."""
     return mean(rows, ("correct", 1))
 
 
@@ -196,7 +201,7 @@ def budget_name(budget: int | None) -> str:
 def standard_tables(
     features: Sequence[LocalFeature], rows: Rows, key: str, what: str
 ) -> list[Table]:
-    """Tabulate the rows; `what` names the data in the titles."""
+    """Tabulate the rows. `key` begins the keys of the tables; `what` names the data in titles."""
     tables: list[tuple[str, str, Columns, str]] = [
         (
             f"repeatability_{radius:g}px",
@@ -296,29 +301,37 @@ ACCURACY_COLUMNS: Columns = {
 COVERAGE_COLUMNS: Columns = {budget_name(b): average(".3f", ("coverage", b)) for b in BUDGETS}
 
 REPEATABILITY_NOTE = (
-    "Number of mutual nearest neighbours, at most the radius apart, divided by the smaller number "
-    "of keypoints that both images show; positions count once; mean over the pairs. Chance: the "
-    f"value of as many random points. Chance-corrected: 0 is chance, 1 is all; a dash where "
-    f"chance is over {MAX_CHANCE:.0%}. A dash also means that a method finds under "
-    f"{MIN_FILLED:.0%} of the budget. Localization: mean distance of the pairs of keypoints."
+    "The columns are numbers of best keypoints per image (budgets). Repeatability: number of pairs "
+    "of keypoints that are mutual nearest neighbours and at most the radius apart, divided by the "
+    "number of keypoints in the overlap of the images, in the image that has fewer there; several "
+    "keypoints at one position count once; mean over the image pairs. Chance: the same for as many "
+    "random points. Chance-corrected: 0 is as good as chance, and 1 means that all keypoints are "
+    f"repeated; a dash if chance is over {MAX_CHANCE:.0%}. All three have a dash if a method finds "
+    f"under {MIN_FILLED:.0%} of the budget. Localization: mean distance in such pairs of keypoints."
 )
 
 KIND_NOTE = (
-    f"Mutual-NN repeatability and correct matches at 1 px, with {MATCHING_BUDGET:,} keypoints, by "
-    "kind of change between the two images. Values are means over the pairs of a kind."
+    "For each kind of change between the two images: mutual-NN repeatability within two radii, and "
+    f"number of correct matches within 1 px, with the best {MATCHING_BUDGET:,} keypoints. Values "
+    "are means over the pairs of a kind."
 )
 
 HOMOGRAPHY_NOTE = (
-    f"{MATCHING_NOTE} MAGSAC at {INLIER_THRESHOLD_PX:g} px. Error: mean distance between the first "
-    "image's corners mapped by the estimated and by the true homography, in original pixels; a "
-    "pair without a homography counts as wrong. Accuracy: fraction of the pairs with an error up "
-    "to a threshold; AUC: area under this curve, as in SuperGlue. Mean and standard deviation (±) "
-    f"are over {SEEDS} seeds of MAGSAC."
+    f"{MATCHING_NOTE} MAGSAC estimates a homography from the matches, with an inlier threshold of "
+    f"{INLIER_THRESHOLD_PX:g} px. Error: the corners of the first image are mapped by the "
+    "estimated and by the true homography, and the error is their mean distance in pixels of the "
+    "second image; it is infinite for pairs without an estimate. Accuracy: fraction of the pairs "
+    "with an error up to a threshold; AUC: area under the curve of this fraction, as in SuperGlue. "
+    f"Values are means over {SEEDS} seeds of MAGSAC; ± is the standard deviation over the seeds."
 )
 
 ACCURACY_NOTE = (
-    "Fraction of the matches within each distance, mean over the pairs. All methods match the best "
-    f"{MATCHING_BUDGET:,} keypoints by mutual nearest neighbours without a ratio test."
+    "Fraction of the matches with an error up to each number of pixels, mean over the pairs. All "
+    f"methods match the best {MATCHING_BUDGET:,} keypoints by mutual nearest neighbours without a "
+    "ratio test."
 )
 
-COVERAGE_NOTE = "Fraction of the first image's cells of 32x32 px that contain a keypoint."
+COVERAGE_NOTE = (
+    "The first image is divided into cells of 32x32 px. Coverage: fraction of the cells that "
+    "contain a keypoint, for each number of best keypoints; mean over the pairs."
+)

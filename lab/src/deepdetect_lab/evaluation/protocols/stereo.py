@@ -1,4 +1,4 @@
-"""Evaluate points of stereo pipelines by the true disparity: Figure 8 of the paper."""
+"""Evaluate the points of stereo pipelines by the true disparity, and draw the paper's Figure 8."""
 
 from __future__ import annotations
 
@@ -25,48 +25,52 @@ from .paper_numbers import FIGURE_8, with_paper_column
 from .stereo_pipelines import ROUNDS, Pipeline, pipelines
 
 TRUTH_OFFSETS = {"dolls": 2}
-"""Distances, in stereo baselines, by which the view of the ground truth lies to the left of the
-left image.
+"""Scenes whose true disparity map was made for another viewpoint than that of the left image. The
+viewpoint lies this number of stereo baselines farther to the left.
 
-The shift reduces the photometric error of the ground truth to below 0.7 times the original. Both
-versions are evaluated.
+If the map is shifted by this distance, the photometric error between the two images under its
+disparities falls below 0.7 times the original error. Results are evaluated by both maps.
 """
 
 AS_IT_IS = ""
 SHIFTED = "ground truth shifted to its photographs"
 
 TEXT = (
-    "Ours: `deepdetect reconstruct --rectified`, which leaves out points at disparity "
-    "discontinuities; --density 1 gives a point for every pixel and fills pixels that only the "
-    "left view shows. The paper's pipeline, as in the authors' notebooks: images resized to "
-    "480x480 as BGR, SIFT descriptors, FLANN (10 trees, 100 checks), a ratio for each scene "
-    "(cones, rocks, cloth 0.9, dolls 0.85, moebius 0.77; others 0.9), essential matrix by RANSAC "
-    "at 0.5 px. SIFT: the same with SIFT keypoints. SGBM: block size 5, three-way mode, uniqueness "
-    "ratio 10, speckle filter, both views extended."
+    '"Ours": `deepdetect reconstruct --rectified`, which leaves out points at disparity '
+    'discontinuities. "All pixels, --density 1" gives a point for every pixel, and fills in '
+    'disparities of pixels that only the left view shows. "The paper\'s pipeline", as in the '
+    "authors' notebooks: images are resized to 480x480 with colours in the order BGR, SIFT "
+    "descriptors are matched by FLANN (10 trees, 100 checks) with a ratio for each scene (cones, "
+    "rocks, cloth 0.9; dolls 0.85; moebius 0.77; others 0.9), and the inliers of an essential "
+    "matrix by RANSAC at 0.5 px are kept. SIFT: the paper's pipeline with SIFT keypoints. SGBM: "
+    "OpenCV's semi-global matching with block size 5, three-way mode, uniqueness ratio 10, a "
+    "speckle filter, and views that are extended beyond their borders."
 )
 
 NOTE = (
-    "1 - bad-t: fraction of the points with ground truth whose error is at most t px; EPE: their "
-    "mean error; completeness: fraction of the pixels with ground truth, occluded ones included, "
-    "that have a point with an error of at most 1 px; F-score: harmonic mean of both. "
-    "Half-occluded: the true counterpart is outside the right image. The paper's numbers of voxels "
-    f"are inliers of the essential matrix. Seconds: median of {ROUNDS} runs (ours, SGBM) or one "
-    "run, with images in memory. MB: memory growth of the process, in the largest run."
+    "Errors of disparity are measured at points with ground truth. 1 - bad-t: fraction of these "
+    "points whose error is at most t px; EPE: their mean error; completeness: fraction of the "
+    "pixels with ground truth, occluded ones included, that have a point with an error of at most "
+    "1 px; F-score: harmonic mean of 1 - bad-1 and completeness. Half-occluded: number of points "
+    "whose true counterpart is outside the right image. Points in the paper: the numbers that it "
+    f"gives for voxels, which are inliers of the essential matrix. Seconds: median of {ROUNDS} "
+    "runs (ours, SGBM) or time of a single run, with images in memory. MB: growth of the process's "
+    "memory, the largest of these runs."
 )
 
 SHIFTED_NOTE = (
-    "The true disparity belongs to another view than the photographs. Here it is shifted by whole "
-    "stereo baselines, which fits the photographs far better; pixels hidden in the left view are "
-    "left out."
+    "The published disparity map of this scene belongs to another viewpoint than the left "
+    "photograph. Here the map is shifted by whole stereo baselines to the viewpoint with which the "
+    "photographs agree far better. Points of the map that are hidden in this view are left out."
 )
 
 
 def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Reconstruct the stereo pairs by all pipelines (Figure 8)."""
+    """Run the benchmark: reconstruct each stereo pair by each pipeline, and draw Figure 8."""
     folder = run.folder("middlebury")
     scenes = {path.parent.name: path.parent for path in sorted(folder.glob("*/left.png"))}
     if not scenes:
-        raise ImageError(f"there is no SCENE/left.png with right.png in {folder}: put scenes there")
+        raise ImageError(f"{folder} has no folders with left.png and right.png: put scenes there")
     compared = pipelines(options)
     rows = run.rows("", compared, scenes, partial(reconstruct_points, run))
     tables: list[Table] = []
@@ -87,9 +91,10 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
-    """Reconstruct a scene, cached.
+    """Reconstruct a scene by a pipeline, or read the result from the cache.
 
-    Returns the "pixels", their "disparity", and the columns that do not depend on ground truth.
+    Returns the "pixels" with a point, (N, 2), their "disparity", (N,), and the table columns that
+    do not depend on ground truth.
     """
 
     def make() -> Row:
@@ -119,7 +124,7 @@ def points_table(
     which: str,
     truth: np.ndarray | None,
 ) -> Table:
-    """Tabulate number and accuracy of the points, time and memory for all pipelines."""
+    """Tabulate points, time and memory of each pipeline, and errors if `truth` is not None."""
     columns = {
         **{"pipeline": "", "points": ",d", "of them filled": ",d"},
         **{f"1 - bad-{tolerance:g}": ".4f" for tolerance in DISPARITY_TOLERANCES_PX},
@@ -137,7 +142,7 @@ def points_table(
     key = f"middlebury_{pair.name}" + ("_shifted" if which == SHIFTED else "")
     paper = {p.name: p.paper[pair.name] for p in compared if pair.name in p.paper}
     title = f"{pair.name}, {which}" if which else pair.name
-    unknown = "" if truth is not None else "There is no true disparity to evaluate by. "
+    unknown = "" if truth is not None else "This scene has no ground truth. "
     note = f"{SHIFTED_NOTE} {NOTE}" if which == SHIFTED else unknown + NOTE
     return with_paper_column(Table(key, title, columns, lines, note), "points", paper)
 
@@ -153,7 +158,7 @@ def _triangulate(
 def clouds_figure(
     pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, Row]
 ) -> Figure | None:
-    """Draw Figure 8 with the points of the pipelines that the paper draws; None without points."""
+    """Draw Figure 8 with the clouds of the pipelines that the paper draws; None without points."""
     clouds = {}
     # Our pipeline comes last, as in the paper.
     for pipeline in sorted(compared, key=lambda pipeline: pipeline.drawn == "ours"):
@@ -174,16 +179,17 @@ def clouds_figure(
 
 
 def ground_truths(scene: Path) -> Mapping[str, np.ndarray | None]:
-    """Return the true disparity of a scene from its file and, for some scenes, also shifted."""
+    """Return the true disparity map of a scene as stored and, for `TRUTH_OFFSETS`, also shifted."""
     disparity = load_middlebury(scene).disparity
     offset = TRUTH_OFFSETS.get(scene.name, 0)
     return {AS_IT_IS: disparity} | ({SHIFTED: shift_view(disparity, offset)} if offset else {})
 
 
 def shift_view(disparity: np.ndarray, baselines: int) -> np.ndarray:
-    """Warp a disparity map to a view that is `baselines` stereo baselines farther to the right.
+    """Warp a disparity map to a viewpoint that is `baselines` stereo baselines farther right.
 
-    If several points map to one pixel, the nearest is visible. Pixels without a point are NaN.
+    If several points land on one pixel, the nearest one hides the others. Pixels on which no point
+    lands are NaN.
     """
     rows, columns = np.nonzero(np.isfinite(disparity))
     values = disparity[rows, columns]

@@ -1,4 +1,4 @@
-"""Evaluate matches of stereo pairs by descriptors alone, with the true disparity and chance."""
+"""Match stereo pairs by descriptors alone, and evaluate the matches by the true disparity."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from ..unguided import UPRIGHT_SIFT, match_unguided
 def score_stereo_matches(
     sources: Mapping[str, AnyDetector], pairs: Sequence[StereoPair], *, quiet: bool = True
 ) -> list[dict[str, Any]]:
-    """Match rectified pairs with several sources of keypoints, and evaluate the matches.
+    """Match rectified pairs with the keypoints of several detectors, and evaluate the matches.
 
-    Descriptors are matched over the whole image, without using the rectification or the true
-    disparity. The result of each source is followed by that of random points at the same density,
-    because more keypoints always find more matches. The result of all pixels comes last.
+    `sources` maps names to detectors. Descriptors are matched over the whole image, without using
+    the rectification or the true disparity. Returns a row for each detector and pair. The rows of a
+    detector are followed by those of random points at the same density, because more keypoints
+    always find more matches. Rows for matching all pixels come last.
     """
     rows: list[dict[str, Any]] = []
     with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
@@ -45,7 +46,7 @@ def score_stereo_matches(
 
 
 def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None = None) -> Matches:
-    """Match both views by descriptors alone, without estimating their geometry."""
+    """Match the two views by descriptors alone, without estimating a geometry."""
     selection = SelectionOptions(density=density)
     return match_unguided(
         pair.left, pair.right, detector, selection=selection, descriptor=UPRIGHT_SIFT
@@ -53,5 +54,5 @@ def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None 
 
 
 def match_random_points(pair: StereoPair, density: float) -> Matches:
-    """Match random points of a density in keypoints per pixel, as a chance baseline."""
+    """Match random points as a chance baseline. `density` is their number per pixel."""
     return match_stereo(pair, RandomDetector(), max(density, 1e-6))

@@ -1,4 +1,4 @@
-"""Pipelines from a stereo pair to points: ours, the paper's, OpenCV's SGBM, and chance."""
+"""Pipelines from a stereo pair to points with disparities: ours, the paper's, SGBM, and chance."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from .paper_numbers import FIGURE_8
 
 ROUNDS = 3
-"""Pipelines that take seconds run this number of times. The run of median time is reported."""
+"""Pipelines that take only seconds run this number of times, and their median time is reported."""
 
 Points = tuple[np.ndarray, np.ndarray, int]
-"""Positions in pixels of the left image, (N, 2) float32, their disparities, (N,) float32, and the
-number of filled-in disparities."""
+"""The result of a pipeline: positions of points in the left image in pixels, (N, 2) float32; their
+disparities in pixels, (N,) float32; and the number of disparities that were filled in instead of
+matched."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """A pipeline from two images to points. `name` is also the title in tables.
+    """A pipeline that finds disparities in a stereo pair. `name` is its title in tables.
 
-    `prepare` returns the function that is timed. Results depend on name and `version`. `drawn` is
-    the title in Figure 8, or empty if the pipeline is not drawn. `paper` is the number of points in
-    the paper by scene.
+    `prepare` does untimed work and returns the function to time, which is run `rounds` times.
+    `name` and `version` identify cached results. `drawn` is the title in Figure 8, or "" if the
+    pipeline is not drawn. `paper` maps scenes to the numbers of points that the paper gives.
     """
 
     name: str
@@ -58,14 +59,15 @@ PAPER_SETTINGS: dict[str, tuple[float, float, float, float]] = {
     "rocks": (0.9, 1512, 638, 555),
     "cloth": (0.9, 1050, 641, 555),
 }
-"""Ratio, focal length and principal point (pixels) of each scene, from the authors' notebooks."""
+"""Settings for each scene from the notebooks of the paper's authors: the threshold of the ratio
+test, then in pixels the focal length and the x and y of the principal point."""
 
 PAPER_FLANN_TREES = 10
 PAPER_FLANN_CHECKS = 100
 
 
 def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
-    """Return the compared pipelines, chance baselines last."""
+    """Return the pipelines that the benchmark compares, chance baselines last."""
     native = options.native_detector()
     detectors = {Path(each).stem: native.with_weights(each) for each in options.geometry_weights}
     found: list[Pipeline] = []
@@ -128,7 +130,7 @@ def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = 
         return points0.astype(np.float32), disparity, 0
 
     def prepare(scene: CalibratedStereoPair) -> Callable[[], Points]:
-        feature.detect(scene.left)  # the first run at an image size takes longer
+        feature.detect(scene.left)  # the first run of a network at an image size takes longer
         return partial(run, scene)
 
     return Pipeline(feature.title, prepare, feature.version, 1, drawn, paper)
@@ -137,10 +139,11 @@ def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = 
 def paper_points(
     feature: LocalFeature, scene: CalibratedStereoPair, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match a stereo pair; return the (M, 2) inliers of the essential matrix ("voxels").
+    """Match a stereo pair as the paper does; return the matched positions in both images, (M, 2).
 
-    The number of points depends on the random choices of RANSAC: another seed of FLANN's trees, or
-    another order of the matches, changes it by up to 1 %.
+    The matches are the inliers of the essential matrix, which the paper calls voxels. Their number
+    depends on the random choices of RANSAC: another seed of FLANN's trees, or another order of the
+    matches, changes it by up to 1 %.
     """
     images = scene.left, scene.right
     ratio, camera_matrix = paper_settings(scene)
@@ -157,7 +160,10 @@ def paper_points(
 
 
 def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
-    """Return ratio and camera matrix from the authors, or the scene's own and their usual ratio."""
+    """Return the threshold of the ratio test and the (3, 3) camera matrix for a scene.
+
+    They are those of `PAPER_SETTINGS`. Other scenes get the ratio 0.9 and their own camera matrix.
+    """
     camera = scene.calibration.camera0.matrix
     own = 0.9, camera[0, 0], camera[0, 2], camera[1, 2]
     ratio, focal, x, y = PAPER_SETTINGS.get(scene.name, own)
@@ -167,7 +173,10 @@ def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
 def essential_inliers(
     points0: np.ndarray, points1: np.ndarray, camera_matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inliers of the essential matrix. Triangulation is only run for its time."""
+    """Return the matches that are inliers of the essential matrix.
+
+    They are also triangulated, because the paper's pipeline does so and its time is measured.
+    """
     if len(points0) < 6:
         return points0[:0], points1[:0]
     essential, inliers = cv2.findEssentialMat(
@@ -190,10 +199,10 @@ def essential_inliers(
 
 
 def sgbm(scene: CalibratedStereoPair) -> Points:
-    """Run OpenCV's semi-global matching on every pixel, with the disparity range that ours finds.
+    """Match every pixel by OpenCV's semi-global matching.
 
-    The range starts at 0 or below. Views are extended by the range, so that pixels near the borders
-    also get disparities.
+    The range of disparities is the one that our pipeline finds, extended to start at 0 or below.
+    The views are extended by this range, so that pixels near the borders also get disparities.
     """
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
     search = find_disparity_range(*gray)
@@ -213,10 +222,11 @@ def sgbm_disparity(
     borders_px: tuple[int, int] = (0, 0),
     min_disparity: int = 0,
 ) -> np.ndarray:
-    """Run OpenCV's semi-global matching on RGB views, extended by borders on the left and right.
+    """Match two rectified RGB views by OpenCV's semi-global matching.
 
-    The number of tried disparities is a multiple of 16. Returns disparities in pixels, (H, W)
-    float32, NaN where none was found.
+    The views are extended on the left and right by `borders_px`. The `num_disparities` to try,
+    from `min_disparity` on, must be a multiple of 16. Returns the disparities of the left view in
+    pixels, (H, W) float32, NaN where none was found.
     """
     matcher = cv2.StereoSGBM_create(
         minDisparity=min_disparity,
@@ -242,7 +252,7 @@ def sgbm_disparity(
 
 @lru_cache(maxsize=1)
 def _compile_kernels() -> None:
-    """Run once on a small scene, so that measured times do not include compilation."""
+    """Reconstruct a small synthetic scene once, so that no measured time includes compilation."""
     scene = np.random.default_rng(0).integers(0, 256, (96, 160), np.uint8)
     scene = cv2.GaussianBlur(scene, (0, 0), 1)
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (160, 96)))
