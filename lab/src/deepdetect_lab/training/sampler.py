@@ -92,8 +92,8 @@ class CropSampler(Sampler[list[CropIndex]]):
 
     Args:
         schedule: the steps.
-        shard_sizes: number of images in each shard, if they are stored in shards, which should be
-            read one after the other. None: images can be read in any order.
+        shard_sizes: number of images in each shard, so that the crops of only a few shards are
+            mixed at a time. None: the images are not in shards, and are all mixed.
         first_step, last_step: the batches go from the first step to the step before the last; by
             default over all steps.
 
