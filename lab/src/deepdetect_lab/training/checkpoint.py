@@ -43,7 +43,7 @@ def save_checkpoint(
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return the tensors and the metadata of a checkpoint; raise a WeightsError if damaged."""
+    """Return a checkpoint's tensors and metadata; raise a WeightsError if it is damaged."""
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in list(file.keys())}
@@ -65,8 +65,8 @@ def restore(
 ) -> None:
     """Restore a network, its moving average and its optimisers from a checkpoint of the same run.
 
-    The shapes of moments are not checked here. A fused optimiser would write past the end of a
-    moment that is too small.
+    The caller makes sure that it is the same run. Shapes of moments are not checked here, and a
+    fused optimiser would write past the end of a moment that is too small.
     """
     for kind, module in (("network", network), ("average", average)):
         module.load_state_dict({name: tensors[f"{kind}.{name}"] for name in module.state_dict()})

@@ -42,7 +42,7 @@ ONNX = "deepdetect.onnx"
 def initial_network(
     options: TrainingOptions, init_weights: InitWeights | None
 ) -> tuple[TrainingOptions, nn.Module]:
-    """Make the network with its initial weights; return it after the completed options.
+    """Return the completed options, and the network with its initial weights.
 
     If `frozen_batch_norm` is None, it becomes true with trained initial weights, else false.
     """
@@ -162,7 +162,7 @@ class DenseTrainer(Trainer):
         return f"{self.device.type}, {precision}, {'compiled' if self.compiled else 'eager'}"
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of batches (images, labels), as `CropDataset` makes them."""
+        """Return a loader of the batches (images, labels) for steps `first` to `last` - 1."""
         sampler = CropSampler(self.schedule, self.data.training.shard_sizes, first, last)
         return self._loader(CropDataset(self.data.training, self.options), batch_sampler=sampler)
 
@@ -171,7 +171,8 @@ class DenseTrainer(Trainer):
             dataset,
             num_workers=self.device_options.worker_count,
             pin_memory=self.device.type == "cuda",
-            generator=torch.Generator(),  # the default would change the user's random state
+            # torch's default generator would change the user's random state.
+            generator=torch.Generator(),
             **batches,
         )
 
@@ -182,7 +183,7 @@ class DenseTrainer(Trainer):
         return self.schedule.learning_rate(step)
 
     def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
-        """Return the loss of images, (B, crop, crop, 3) uint8 RGB, with bool labels."""
+        """Return the loss of images (B, crop, crop, 3) uint8 with labels (B, crop, crop) bool."""
         images, masks = batch
         self.network.train()
         if self.options.frozen_batch_norm:
@@ -192,7 +193,7 @@ class DenseTrainer(Trainer):
         return binary_cross_entropy_with_logits(logits, truth, pos_weight=self._pos_weight(images))
 
     def _pos_weight(self, images: Tensor) -> Tensor | None:
-        """Return the weight in the loss of pixels that are marked in the labels.
+        """Return the weight that the loss gives to pixels that are marked in the labels.
 
         It has the shape (B, 1, 1, 1), one weight for each image, or (1,), one for all images. None
         means that all weights are 1.

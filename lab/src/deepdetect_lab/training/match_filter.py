@@ -60,8 +60,8 @@ MEAN_COSINE = 0.7
 subtracted from the feature, so that the mean becomes about 0."""
 
 LEAST_TRUST = 0.5
-"""The weighted mean of the neighbours' messages is divided by the sum of the weights plus this
-number. So the mean is near 0 if all weights are near 0. Chosen by hand."""
+"""The weighted sum of the neighbours' messages is divided by the sum of the weights plus this
+number. So the result is near 0 if all weights are near 0. Chosen by hand."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
 """The views are squares with `SIDE_PX` pixels a side, and have at most `KEYPOINTS` keypoints each.
@@ -100,7 +100,7 @@ Sample = tuple[dict[str, np.ndarray], np.ndarray]
 
 
 class MatchFilter(nn.Module):
-    """A network that returns a logit for each match: whether its neighbours show it is correct."""
+    """A network that returns, for each match, the logit of the probability that it is correct."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -125,7 +125,7 @@ class MatchFilter(nn.Module):
         ratios: Tensor,
         around: Tensor,
     ) -> Tensor:
-        """Return a logit for each match, (M,), which is positive if it is more likely correct.
+        """Return the logits (M,) of matches, positive if a match is more likely correct than wrong.
 
         The inputs are positions (M, 2) and sizes (M,) of the matched keypoints in both images, in
         pixels. Then come the rotations (M,) between them in radians, and the distance ratios (M,).
@@ -316,7 +316,7 @@ class MatchFilterTrainer(Trainer):
         self.notes = {"images": str(len(images))}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of batches, each as returned by `join`."""
+        """Return a loader of the batches for steps `first` to `last` - 1, as returned by `join`."""
         steps = range(first, self.steps if last is None else last)
         dataset = BatchDataset(self.samples, self.options)
         return DataLoader(dataset, batch_size=None, sampler=steps, generator=torch.Generator())

@@ -85,11 +85,12 @@ class TrainingOptions:
         square: make images square: "crop" takes the central square, "squash" resizes without
             keeping the aspect ratio, as in the paper. None: keep the aspect ratio.
         max_images: use at most this many images, including those for validation.
-        val_fraction: fraction of the images held out for validation if no folder is given.
+        val_fraction: fraction of the images held out for validation, if there is no folder of
+            validation images.
         dark_fraction: fraction of darkened crops (paper: a quarter).
-        augmentations: number of augmented views of each image, rotated, relit, blurred, noisy or
-            compressed. There are as many again in dark light. They have the first size. Each is
-            used as often as the original view of a size.
+        augmentations: number of augmented views of each image (rotated, relit, blurred, noisy or
+            compressed), in normal light and again in dark light. Their size is the first of
+            `short_sides`. Each is used as often as the original view of a size.
         transpositions: mirror half of the crops along their diagonal. Only BRISK would label a
             mirrored crop differently. Flips would also change labels of Shi-Tomasi, SIFT and ORB.
         color_jitter: fraction of the crops whose colours are removed or rotated. The luma, on which
@@ -99,8 +100,8 @@ class TrainingOptions:
         warm_up: fraction of the steps over which the learning rate rises from zero. It protects
             trained initial weights: in the first steps, Adam has seen too few gradients to choose
             good step sizes, and would undo much of the earlier training.
-        average_decay: decay per step of the exponential average of the weights. The average is
-            validated and saved. With 0, it equals the weights themselves.
+        average_decay: decay per step of the exponential average of the weights; the average is
+            validated and saved, and with 0 it equals the weights.
         max_gradient_norm: gradients with a larger norm are scaled down to it; None: no limit.
         frozen_batch_norm: normalise by the batch statistics stored with the initial weights,
             because the statistics of small batches vary much. None: only if the initial weights are
@@ -171,7 +172,7 @@ class TrainingOptions:
     def _check_sizes(self) -> None:
         if not self.stages or not self.short_sides or min(self.short_sides) < 16:
             raise OptionError(
-                "give at least one of `stages`, and `short_sides` of at least 16 pixels"
+                "give one or more `stages` and `short_sides`, and no side below 16 pixels"
             )
         for side in (side for stage in self.stages for side in stage.sides):
             if side not in self.short_sides:
@@ -240,8 +241,8 @@ class PointsTrainingOptions:
         pairs: pairs of views in each step.
         side: side of the square views, in pixels.
         learning_rate: highest learning rate; cosine annealing ends at 2 % of it.
-        min_density, max_density: range of the number of keypoints per pixel that the ranker learns
-            to choose. Each pair gets a number from this range, log-uniformly distributed.
+        min_density, max_density: smallest and largest number of keypoints per pixel that the ranker
+            learns to choose. Each pair gets a number in between, log-uniformly distributed.
         val_count: number of validations, besides one before the first step.
         val_pairs: number of validation pairs of each kind: zoom, blur, viewpoint, light.
         seed: seed of the weights and the pairs.

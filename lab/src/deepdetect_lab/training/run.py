@@ -56,12 +56,13 @@ def train(
         output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx,
             MODEL_CARD.md and the loss curves.
         options: the recipe.
-        validation: folder of other images. None: some of the images are held out.
-        labels: folder of the label cache. None: in `output`.
+        validation: folder of other images for the validation. None: some of the images are held
+            out.
+        labels: folder in which labels are cached. None: a folder in `output`.
         init_weights: weights to start from: .safetensors files, or the bundled weights "default",
             "dense", "free" or "espnet"; several weights are averaged. None: random weights by the
             seed.
-        device: how the network runs.
+        device: device, precision, compilation and processes.
         workers: number of processes that make labels. None: one per processor.
         log: function that is called with each line of text for the user. None: there is no text,
             and there are no progress bars.
@@ -99,7 +100,7 @@ def train_on_pairs(
     num_workers: int | None = None,
     log: Log | None = None,
 ) -> TrainingResult:
-    """Train a network on pairs of synthetic views, each generated from single images.
+    """Train a network on pairs of synthetic views of single images.
 
     The class of `options` chooses the network: the keypoint ranker, the learned descriptor, or the
     match filter. A match filter takes a quarter of an hour on two processors. An interrupted run
@@ -202,8 +203,8 @@ def profile(
     """Time some steps of each stage of a `train` run; only the label cache is written.
 
     Returns for each stage the crops per second, the same speed in images of 480x480 pixels per
-    second, the fraction of the time spent waiting for data, and the peak memory so far in bytes
-    (0 if unknown), also that of the GPU.
+    second, the fraction of the time spent waiting for data, and the peak memory so far (0 if
+    unknown) of the process and of the GPU, in bytes.
     """
     from ..evaluation.profiling import peak_memory
     from .dataset import loading

@@ -33,9 +33,10 @@ class CropIndex(NamedTuple):
 
 
 class Position(NamedTuple):
-    """Position of a step: its stage, the number of its first crop in it, and its first epoch.
+    """Position of a step in its stage.
 
-    `sample` counts the crops from the start of the stage. `first_epoch` is that of the stage.
+    `sample` is the number of the step's first crop, counted from the start of the stage.
+    `first_epoch` is the number of the first epoch of the stage.
     """
 
     stage: Stage
@@ -83,7 +84,7 @@ class Schedule:
 
 
 def milestones(steps: int, count: int) -> set[int]:
-    """Return the numbers of steps done at `count` evenly spaced points, including the end."""
+    """Return the steps after which to validate: `count` evenly spaced ones, including the last."""
     return {round(steps * part / count) for part in range(1, count + 1)} - {0}
 
 

@@ -50,7 +50,7 @@ light, because shot noise grows with the number of photons."""
 
 
 def happens(rng: np.random.Generator, share: float) -> bool:
-    """Draw whether an effect with the probability `share` happens, but draw nothing if 0 or 1."""
+    """Draw whether an effect happens, with probability `share`; 0 and 1 use no random number."""
     return share >= 1 or (share > 0 and rng.random() < share)
 
 
@@ -227,7 +227,7 @@ def rotation(angle: float) -> np.ndarray:
 
 
 def scaled_along(azimuth: float, along: float, across: float) -> np.ndarray:
-    """Return the matrix (2, 2) that scales by `along` in a direction, and by `across` across it.
+    """Return the matrix (2, 2) that scales by `along` in a direction, by `across` perpendicularly.
 
     The direction `azimuth` is in radians.
     """

@@ -114,7 +114,7 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches from step `first` to the one before `last` (the end)."""
+        """Return a loader of the batches for steps `first` to `last` - 1; None: to the end."""
 
     def pixels(self, batch: Any) -> int:
         """Return the number of pixels in a batch, from which the speed is computed; 0: no speed."""

@@ -1,4 +1,4 @@
-"""The contrastive loss of pairs of views, and their metric, the share of correct mutual matches."""
+"""The contrastive loss of pairs of views, and the validation metric: correct mutual matches."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def kind_of(angle: float, zoom: float) -> str:
 
 
 def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
-    """Return the descriptors of both views' keypoints, (B, N, 64) each, not rotated by angles."""
+    """Describe the keypoints of both views, without undoing any rotation; (B, N, 64) each."""
     images = batch.images.transpose(0, 1).flatten(0, 1)[:, None].float() / 255
     with torch.autocast(images.device.type, torch.bfloat16):
         maps = network.maps(images.contiguous(memory_format=torch.channels_last))

@@ -31,8 +31,8 @@ need those of the image reduced to 1/2 or 1/4, which are interpolated between oc
 
 SMALLEST_SIZE_PX = 2.5
 NOISE = 1 / 255
-"""Variations of the luma around this standard deviation, one grey level, count as noise. So the
-normalisation by local contrast does not amplify smaller variations to full contrast."""
+"""Variations of the luma with about this standard deviation, one grey level, count as noise. So the
+normalisation by local contrast does not amplify them to full contrast."""
 
 CELL_PX, CELLS = 8, 5
 """Local contrast is computed in squares of 5x5 cells, each of 8x8 pixels. Chosen by hand; not

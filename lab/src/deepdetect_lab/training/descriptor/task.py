@@ -74,7 +74,7 @@ def stack(pairs: Sequence[Pair]) -> Pair:
 
 
 class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
-    """The pairs that each step is the first to use. The seed and its number determine a pair."""
+    """The pairs that each step is the first to use, determined by the seed and their numbers."""
 
     def __init__(self, files: Sequence[Path], options: DescriptorTrainingOptions) -> None:
         self.files, self.options = files, options
@@ -142,7 +142,7 @@ class DescriptorTrainer(Trainer):
         self.average = copy.deepcopy(self.network).eval()
         self.network.train()
         # Muon suits layers between many features. AdamW trains the other parameters: the first
-        # layer, the layers of the keypoint's size, and vectors.
+        # layer, the layers that take the keypoint's size, and vectors.
         kernels: list[Any] = []
         vectors: list[Any] = []
         for name, parameter in self.network.named_parameters():
@@ -155,9 +155,9 @@ class DescriptorTrainer(Trainer):
         self.milestones = milestones(options.steps, options.val_count)
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader that yields for each step its number, and its new pairs.
+        """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
 
-        Before the new pairs come their numbers. Without new pairs, None stands in their place.
+        The pairs are those that no earlier step has used, or None if there are none.
         """
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(

@@ -40,8 +40,9 @@ LEAST_KEYPOINTS, LEAST_IF_ZOOMED, ZOOMED = 64, 40, 0.8
 logarithm of the zoom between the views is above `ZOOMED`, the limit is `LEAST_IF_ZOOMED`."""
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
-"""The `STRONGEST` candidates of the first view are used. Their sigma is below `MAX_FIRST_SIGMA_PX`,
-because the areas that describe larger ones do not fit into a view of 256 pixels."""
+"""Only the `STRONGEST` best candidates of the first view are used. Their sigma is below
+`MAX_FIRST_SIGMA_PX`, because the areas that describe larger ones do not fit into a view of 256
+pixels."""
 
 SIGMA_RANGE_PX = (1.0, 13.0)
 """Keypoints are left out if their sigma in the second view is not in this range. Smaller keypoints

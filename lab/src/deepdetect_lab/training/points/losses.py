@@ -31,8 +31,8 @@ CLOSE_SHARE = 0.7
 of its reward if it is found again within 3 px."""
 
 MIN_CHOICE = 0.1
-"""Candidates whose probability to be chosen is smaller than this have no partners in the other
-view, and are no partners. Chosen by hand."""
+"""Candidates that are chosen with a smaller probability than this have no partner in the other
+view, and are not the partner of another one. Chosen by hand."""
 
 MIN_SPREAD = 1e-3
 BISECTIONS = 40
@@ -61,7 +61,10 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
 
 
 def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
-    """Return the probability (N,) that each candidate is chosen; 0 near one with a larger logit."""
+    """Return the probability (N,) that each candidate is chosen.
+
+    It is 0 for candidates that are suppressed by a close one with a larger logit.
+    """
     logits = ranker(torch.from_numpy(view.features))
     radii = least_distances(view.sigma_px)  # the same as in detection
     kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))

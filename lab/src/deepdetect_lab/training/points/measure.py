@@ -55,7 +55,7 @@ def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPai
 
 
 def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
-    """Return the "score" of a detector, and each measure of each kind under "KIND MEASURE"."""
+    """Return the "score" of a detector, and each measure of each kind of pair, "KIND MEASURE"."""
     repeated: dict[str, list[list[list[float]]]] = {kind: [] for kind in KINDS}
     correct: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:

@@ -107,7 +107,7 @@ def _correspondences(
 
 
 class PairDataset(Dataset[CandidatePair]):
-    """Random pairs of views. The seed, the step, and the number in the step determine a pair."""
+    """Random pairs of views, each determined by the seed, the step, and its number in the step."""
 
     def __init__(self, files: Sequence[Path], options: PointsTrainingOptions) -> None:
         self.files, self.options = list(files), options
@@ -128,7 +128,7 @@ class PairDataset(Dataset[CandidatePair]):
 
 
 def overlap(pair: ViewPair) -> float:
-    """Return the fraction of a view that the other view shows, for the view where it is smaller."""
+    """Return the fraction of a view that the other view also shows: the smaller of both values."""
     side = pair.images[0].shape[0]
     ticks = np.linspace(0, side - 1, 24)
     grid = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)

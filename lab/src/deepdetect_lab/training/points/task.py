@@ -140,7 +140,7 @@ class RankerTrainer(Trainer):
         self.notes = {"images": str(len(self.files))}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of batches, which are lists of `CandidatePair`."""
+        """Return a loader of the batches for steps `first` to `last` - 1, lists of pairs."""
         steps, pairs = range(first, self.steps if last is None else last), range(self.options.pairs)
         return DataLoader(
             PairDataset(self.files, self.options),

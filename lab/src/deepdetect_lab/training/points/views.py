@@ -42,8 +42,8 @@ MAX_ENLARGEMENT = 2.2
 """Zoomed views enlarge the photograph by at most this factor, because more would only show blur."""
 
 SUBTLE = 0.25
-"""Views whose kind is another get a weak blur with this probability. The same holds for a weak
-change of light, and for a weak JPEG compression. Chosen by hand."""
+"""A view whose kind is not "blur" gets a weak blur with this probability. The same holds for
+changes of light and for JPEG compression. Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),
