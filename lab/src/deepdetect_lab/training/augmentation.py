@@ -59,8 +59,7 @@ CAMERA = Camera(blur=Effect(0.3, 0.5, 2.5), noise=(Effect(0.25, 1, 8),), jpeg=Ef
 """Ranges of the changes of light and camera in augmented views. Chosen by hand; not measured."""
 
 MAX_JITTER_SATURATION = 1.2
-"""When the hue is rotated, the saturation is multiplied by a random factor up to this one. Chosen
-by hand."""
+"""A hue rotation also scales the saturation by a random factor up to this one. Chosen by hand."""
 
 
 def draw_darkening(generator: np.random.Generator) -> Darkening:

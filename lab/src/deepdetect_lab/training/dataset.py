@@ -119,8 +119,8 @@ class FolderSource:
                 bar.update(len(missing))
         if failures:
             raise BatchError(
-                f"{len(failures)} of {len(self.images)} images cannot be read; the labels of the "
-                "others are kept",
+                f"{len(failures)} of {len(self.images)} images cannot be read (the labels of the "
+                "others are kept)",
                 failures,
             )
         return total

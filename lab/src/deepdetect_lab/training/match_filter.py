@@ -47,8 +47,7 @@ WIDTH, ROUNDS = 32, 3
 between neighbouring matches. Both are chosen by hand."""
 
 OF_A_MATCH, OF_TWO = 4, 11
-"""Numbers of input features: `OF_A_MATCH` for each match, and `OF_TWO` for each pair of a match and
-one of its neighbours."""
+"""Numbers of input features: `OF_A_MATCH` for a match, `OF_TWO` for a match and a neighbour."""
 
 RATIO_RANGE, RATIO_SCALE, RATIO_OFFSET = (0.05, 1.2), 3, 0.5
 """The distance ratio of a match, as in the ratio test, is clipped to `RATIO_RANGE`. Its logarithm
@@ -74,8 +73,7 @@ odd, so that unrelated pairs occur with each descriptor."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
 """A match with an error below `RIGHT_PX` is correct. A match with an error above `WRONG_PX` is
-wrong. Matches in between are ignored, because the ground truth is only accurate to a pixel or
-two."""
+wrong. Matches in between are ignored, because the ground truth has errors of a pixel or two."""
 
 WARM_UP_STEPS, DECAY_SHARE = 50, 0.7
 """The learning rate rises over the first `WARM_UP_STEPS` steps. Over the last share `DECAY_SHARE`
@@ -85,9 +83,8 @@ WEIGHT_DECAY = 0.01
 """Weight decay of AdamW, the default of torch."""
 
 LEFT_OUT_SHARE, FEWEST_SHARE = 0.5, 0.02
-"""Matches are left out at random in the share `LEFT_OUT_SHARE` of the pairs. At least the share
-`FEWEST_SHARE` of the matches stays. It is only 2 %, since the filter is meant for pairs with few
-matches."""
+"""Matches are left out at random in the share `LEFT_OUT_SHARE` of the pairs. At least
+`FEWEST_SHARE` of them stay: only 2 %, since the filter is meant for pairs with few matches."""
 
 TURNED_SHARE = 0.3
 """Share of the pairs in which both images are rotated by the same random angle. Chosen by hand."""

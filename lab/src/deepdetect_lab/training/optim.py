@@ -27,8 +27,7 @@ large as that of an Adam step (arXiv:2502.16982)."""
 
 MUON_WEIGHT_DECAY = 0.01
 INITIAL_POWER_ITERATIONS = 3
-"""Number of power iterations, starting from the identity matrix, that give the first eigenbasis of
-`Soap`."""
+"""Number of power iterations for the first eigenbasis of `Soap`, starting from the identity."""
 
 
 def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:

@@ -19,8 +19,8 @@ FINAL_LEARNING_RATE = 1e-6
 """Cosine annealing of the learning rate ends at this value (paper, Section III-B)."""
 
 SHUFFLED_SHARDS = 4
-"""Number of shards that are read at the same time. Their images are shuffled together. Chosen by
-hand; not measured."""
+"""Number of shards that are read at a time. Their images are shuffled together. Chosen by hand; not
+measured."""
 
 
 class CropIndex(NamedTuple):

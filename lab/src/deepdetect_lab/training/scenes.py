@@ -34,8 +34,7 @@ from .synthetic import (
 Drawn = TypeVar("Drawn")
 
 SIDE_PX = 256
-"""Default side of the square views in pixels. `PERSPECTIVE` is given for views of this size. Chosen
-by hand."""
+"""Default side of the square views, for which `PERSPECTIVE` is given. Chosen by hand."""
 
 MARGIN_PX = 6
 """Keypoints within this distance of a view's border are not used, because part of their
@@ -83,8 +82,7 @@ from the middle to a border. In first views, the coefficients are multiplied by
 `FIRST_PERSPECTIVE`."""
 
 SHIFT_DEVIATION = 18.0
-"""Standard deviation of the second view's shift along each axis, in pixels of the first view.
-Chosen by hand."""
+"""Standard deviation of the second view's shift, in pixels of the first view. Chosen by hand."""
 
 RELIEF_SHARE, RELIEF_PX = 0.45, (1.5, 5.0)
 """`RELIEF_SHARE` is the share of the second views that have a relief. The standard deviation of its
@@ -97,8 +95,7 @@ area that describes a keypoint."""
 
 FRONT_SHARE, FRONT_COUNTS, OTHER_PHOTOGRAPH_SHARE = 0.5, (1, 1, 2, 3), 0.8
 """`FRONT_SHARE` is the share of the scenes with parts in front. The number of these parts is drawn
-from `FRONT_COUNTS`. The share `OTHER_PHOTOGRAPH_SHARE` of the parts is cut from another photograph,
-the rest from the same."""
+from `FRONT_COUNTS`. The share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs."""
 
 SHAPE_PX, UNCOVERED = 480, (0.6, 0.88)
 """A part in front is cut from a photograph where smooth noise, drawn with `SHAPE_PX` pixels a side,

@@ -188,8 +188,7 @@ def write_shards(
             failures += unread
     if failures:
         raise BatchError(
-            f"{len(failures)} of {len(listed)} images cannot be read; the shards without them are "
-            "kept",
+            f"{len(failures)} of {len(listed)} images cannot be read (other shards are kept)",
             sorted(failures),
         )
     index: dict[str, Any] = {"options": _fixed_options(options)}

@@ -35,8 +35,7 @@ NOISE = 1 / 255
 normalisation by local contrast does not amplify them to full contrast."""
 
 CELL_PX, CELLS = 8, 5
-"""Local contrast is computed in squares of 5x5 cells, each of 8x8 pixels. Chosen by hand; not
-measured."""
+"""Local contrast is that of a square of 5x5 cells of 8x8 pixels. Chosen by hand; not measured."""
 
 BATCH_MOMENTUM = 0.1
 

@@ -29,8 +29,7 @@ ONNX = "descriptor.onnx"
 
 REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
 """Each pair is used in `REUSE` steps on average, because drawing a pair takes longer than training
-on it. A step chooses from the last `WINDOW` pairs, and the first step from `FIRST_BATCHES`
-batches of pairs."""
+on it. A step chooses from the last `WINDOW` pairs, the first step from `FIRST_BATCHES` batches."""
 
 WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
 """The learning rate rises over `WARM_UP_STEPS` steps, but at most over the share `WARM_UP_SHARE` of
@@ -40,8 +39,7 @@ DECAY_SHARE = 0.65
 """The learning rate falls linearly to 0 over this last share of the steps. Chosen by hand."""
 
 VECTOR_RATE = 0.4
-"""AdamW trains the parameters for which Muon is not suited. Its learning rate is this factor times
-that of Muon."""
+"""AdamW trains the parameters that do not suit Muon, at Muon's learning rate times this factor."""
 
 
 def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:

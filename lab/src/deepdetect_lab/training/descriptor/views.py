@@ -41,8 +41,7 @@ logarithm of the zoom between the views is above `ZOOMED`, the limit is `LEAST_I
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
 """Only the `STRONGEST` best candidates of the first view are used. Their sigma is below
-`MAX_FIRST_SIGMA_PX`, because the areas that describe larger ones do not fit into a view of 256
-pixels."""
+`MAX_FIRST_SIGMA_PX`, because the areas around larger ones do not fit into a view of 256 pixels."""
 
 SIGMA_RANGE_PX = (1.0, 13.0)
 """Keypoints are left out if their sigma in the second view is not in this range. Smaller keypoints

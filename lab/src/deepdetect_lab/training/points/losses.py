@@ -23,8 +23,7 @@ SHARPNESS = 25.0
 larger logits alone do not lower it."""
 
 TEMPERATURE = 0.6
-"""Temperature of the sigmoid that turns scaled logits into the probabilities to be chosen. Chosen
-by hand."""
+"""Temperature of the sigmoid that maps scaled logits to probabilities. Chosen by hand."""
 
 CLOSE_SHARE = 0.7
 """A keypoint gets this share of its reward only if it is found again within 1 px. It gets the rest

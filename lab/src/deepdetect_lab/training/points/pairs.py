@@ -18,14 +18,13 @@ from ..recipe import PointsTrainingOptions
 from .views import KINDS, ViewPair, draw_pair
 
 MAX_CANDIDATES = 2000
-"""Only the strongest candidates of each view, at most this number, are ranked. Chosen by hand; not
-measured."""
+"""Views give at most this number of candidates, the strongest. Chosen by hand; not measured."""
 
 REACH_PX = 3.0
 
 MIN_OVERLAP = 0.04
-"""Pairs are drawn again if their views overlap by less than this fraction of a view. Chosen by
-hand; not measured."""
+"""Pairs whose views overlap by less than this fraction are drawn again. Chosen by hand; not
+measured."""
 
 ATTEMPTS = 5
 

@@ -27,8 +27,7 @@ from .measure import measure, validation_pairs
 from .pairs import CandidatePair, PairDataset
 
 STATISTICS_PAIRS = 64
-"""Features are normalised by their mean and standard deviation in this number of pairs of views.
-Chosen by hand."""
+"""Features are normalised by their statistics in this number of pairs of views. Chosen by hand."""
 
 WARM_UP_STEPS = 100
 FINAL_RATE = 0.02
@@ -38,8 +37,7 @@ measured."""
 WEIGHT_DECAY = 1e-4
 
 AVERAGE_DECAY = 0.995
-"""Decay per step of the exponential average of the weights. The average is saved. Chosen by
-hand."""
+"""Decay per step of the exponentially averaged weights, which are saved. Chosen by hand."""
 
 HIDDEN_UNITS = (48, 32)
 MIN_DEVIATION = 1e-3

@@ -114,12 +114,10 @@ LEAST_LOG_ZOOM = math.log(1.3)
 `MAX_ENLARGEMENT`."""
 
 ROTATED_SHARE = 0.2
-"""Share of the pairs in which a random angle is added to the rotations of both views. Chosen by
-hand."""
+"""Share of the pairs in which one random rotation is added to both views. Chosen by hand."""
 
 FOCAL_SIDES = (1.2, 3.0)
-"""Range of the focal length of tilted views, in sides of the view. It gives fields of view from 45
-to 19 degrees."""
+"""Range of the focal length, in sides of the view: fields of view from 45 to 19 degrees."""
 
 SHRUNK_SCALE, LEAST_SIDE_PX = 0.9, 8
 """If a view shows the photograph at a scale below `SHRUNK_SCALE`, the photograph is first shrunk to
