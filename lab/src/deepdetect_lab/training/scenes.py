@@ -103,7 +103,7 @@ is above a quantile. The quantile is drawn from `UNCOVERED`. So parts are blobs 
 hold 12 to 40 % of their photograph."""
 
 FRONT_OFFSET_PX, FRONT_SCALE, FRONT_ANGLE = 60.0, 0.2, 0.3
-"""These numbers limit how the pose of a part in front differs from that of the scene in the first
+"""These numbers say how far the pose of a part in front may be from that of the scene, in the first
 view. `FRONT_OFFSET_PX` is the largest offset along each axis, in pixels of the photograph. The
 others are standard deviations: of the logarithm of the scale, and of the angle in radians."""
 

@@ -37,10 +37,10 @@ Detect = Callable[[np.ndarray], Keypoints]
 
 
 MEASURES = [f"@{radius:g} px {budget}" for budget in BUDGETS for radius in RADII_PX] + ["correct"]
-"""Names of the measures of each kind of pair. The first ones are the mean repeatability within a
-radius for a budget. The last one is the mean number of correct matches, divided by the number of
-keypoints at `MATCHING_BUDGET`. Matches are mutual nearest neighbours of upright RootSIFT of size 4
-that pass a ratio test at 0.85. They are correct within 1 px."""
+"""Names of the measures of each kind of pair. "@1 px 512" is the mean repeatability within 1 px at
+a budget of 512 keypoints. "correct" is the mean number of matches that are correct within 1 px,
+divided by the number of keypoints at `MATCHING_BUDGET`. These matches are mutual nearest neighbours
+of upright RootSIFT of size 4 that pass a ratio test at 0.85."""
 
 
 def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPair]:
