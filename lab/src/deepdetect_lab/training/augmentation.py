@@ -13,11 +13,11 @@ from deepdetect.io.image import luma
 
 from .synthetic import WHITE, Camera, Effect, Light, blur, record, relight
 
-RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
+RED, GREEN, BLUE = 0.299, 0.587, 0.114  # weights of the luma (BT.601)
 
 AUGMENTATION_VERSION = 3
-"""This version is part of the names of augmented views. Increase it when `augment` changes, because
-old labels then do not fit the views."""
+"""This version is part of the names of augmented views and of their label files. Increase it when
+`augment` changes, because existing labels then no longer fit the views."""
 
 
 @dataclass(frozen=True)
@@ -32,19 +32,22 @@ class Darkening:
 
 
 BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
-"""Ranges of the two factors of a `Darkening`. The product of the factors stays below 0.25. So a
-darkened image spans fewer than 64 grey levels, the limit of low visibility."""
+"""Ranges from which the two factors of a `Darkening` are drawn. The product of the factors stays
+below 0.25. So a darkened image spans fewer than 64 of the 256 grey levels, which counts as low
+visibility (`visibility_of`)."""
 
 # What `augment` draws from.
 TURN_PROBABILITY = 0.5
-"""Share of the views that are rotated by any angle. All other views stay sharp, since the
-interpolation of a rotation blurs."""
+"""Share of the augmented views that are rotated by an arbitrary angle. The others are only rotated
+by multiples of 90 degrees, because the interpolation for other angles blurs the view."""
 
 CROP_SCALE = (0.7, 1.0)
-"""Range of the crop's side as a fraction of the largest that fits. Chosen by hand; not measured."""
+"""Range of the side of the cropped square, as a fraction of the largest square that fits into the
+image. Chosen by hand; not measured."""
 
 INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
-"""OpenCV interpolations, from which one is drawn to downscale an upright view."""
+"""Names of OpenCV's interpolations, `cv2.INTER_...`. One is drawn at random whenever a view that is
+not rotated by an arbitrary angle is downscaled."""
 
 LIGHT = Light(
     share=0.5,
@@ -56,7 +59,7 @@ CAMERA = Camera(blur=Effect(0.3, 0.5, 2.5), noise=(Effect(0.25, 1, 8),), jpeg=Ef
 """Ranges of the changes of light and camera in augmented views. Chosen by hand; not measured."""
 
 MAX_JITTER_SATURATION = 1.2
-"""Rotated colours have their saturation multiplied by at most this factor. Chosen by hand."""
+"""A hue rotation also scales the saturation by a random factor up to this one. Chosen by hand."""
 
 
 def draw_darkening(generator: np.random.Generator) -> Darkening:
@@ -68,25 +71,25 @@ def draw_darkening(generator: np.random.Generator) -> Darkening:
 
 
 def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
-    """Reduce brightness, then contrast of (H, W, 3) uint8 (paper, Section III-B)."""
+    """Reduce the brightness, then the contrast, of (H, W, 3) uint8 (paper, Section III-B)."""
     dim = ImageEnhance.Brightness(Image.fromarray(rgb)).enhance(darkening.brightness)
     return np.asarray(ImageEnhance.Contrast(dim).enhance(darkening.contrast))
 
 
 def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror a crop and its label along the diagonal.
+    """Mirror a crop and its label along the main diagonal.
 
-    BRISK is the only label detector that would label the mirrored crop differently.
+    The mirrored label is what all label detectors except BRISK would find in the mirrored crop.
     """
-    # OpenCV copies a hundred times faster than a NumPy view.
+    # `cv2.transpose` is a hundred times faster than copying a transposed NumPy array.
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
 
 
 def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -> np.ndarray:
-    """Remove the colours or rotate the hue of (H, W, 3) uint8 RGB; the luma stays the same.
+    """Remove the colours or rotate the hue of (H, W, 3) uint8 RGB, and keep the luma.
 
-    With `exact` colours are always removed, because a hue rotation may change the luma by one grey
-    level. In dark images this changes keypoints.
+    With `exact`, colours are always removed, because a hue rotation may change the luma by one grey
+    level. In a dark image, this would change the keypoints.
     """
     if exact or generator.random() < 0.5:
         return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
@@ -102,13 +105,14 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
     """
     red, green, blue = cv2.split(rgb.astype(np.float32))
     gray = RED * red + GREEN * green + BLUE * blue
-    # Scaled by their ranges, the two differences are Cb and Cr.
+    # Blue minus grey and red minus grey, divided by their ranges, are Cb and Cr.
     blue_range, red_range = 1 - BLUE, 1 - RED
     blue, red = (blue - gray) / blue_range, (red - gray) / red_range
     cosine, sine = saturation * math.cos(angle), saturation * math.sin(angle)
     blue, red = blue_range * (cosine * blue - sine * red), red_range * (sine * blue + cosine * red)
     green = -(RED * red + BLUE * blue) / GREEN
-    # Distance of each pixel's colours from grey, in multiples of the available range.
+    # For each pixel, the largest difference of a channel from grey, divided by the largest
+    # difference that fits into uint8.
     above = np.maximum(np.maximum(red, green), blue) / np.maximum(255 - gray, 1e-6)
     below = np.minimum(np.minimum(red, green), blue) / np.minimum(-gray, -1e-6)
     scale = 1 / np.maximum(np.maximum(above, below), 1)
@@ -134,10 +138,10 @@ def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) ->
     """Crop a square at a random angle, with all corners inside the image."""
     angle = generator.uniform(0, 2 * math.pi)
     cosine, sine = math.cos(angle), math.sin(angle)
-    extent = abs(cosine) + abs(sine)  # extent of a rotated unit square
+    extent = abs(cosine) + abs(sine)  # side of the bounding box of a rotated unit square
     window = (min(rgb.shape[:2]) - 1) / extent * generator.uniform(*CROP_SCALE)
     step = window / side
-    if step > 1:  # area averaging first, against aliasing
+    if step > 1:  # shrink by area averaging first, against aliasing
         factor = 1 / step
         size = (max(round(rgb.shape[1] * factor), 1), max(round(rgb.shape[0] * factor), 1))
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

@@ -18,7 +18,7 @@ from deepdetect._shared.records import key
 from ..networks.weights import save_tensors
 
 Point = dict[str, float]
-"""A point of the training curves: losses and measures by name after a number of steps."""
+"""A point of the training curves: the losses and measures after some step, by name."""
 
 
 def save_checkpoint(
@@ -28,7 +28,7 @@ def save_checkpoint(
     optimizers: Sequence[Optimizer],
     metadata: Mapping[str, Any],
 ) -> None:
-    """Write the tensors of a run, and its metadata as JSON, to a checkpoint.
+    """Write a checkpoint: the tensors of a run, and its metadata as JSON.
 
     Tensors are named "network.NAME", "average.NAME" and "optimizer.MOMENT.PARAMETER".
     """
@@ -43,16 +43,16 @@ def save_checkpoint(
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read tensors and metadata of a checkpoint; raise a WeightsError if it is damaged."""
+    """Return a checkpoint's tensors and metadata; raise a WeightsError if it is damaged."""
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in list(file.keys())}
             header = file.metadata() or {}
         if header["digest"] != _digest(tensors, header["state"]):
-            raise ValueError("its content is not what was written")
+            raise ValueError("its checksum is wrong")
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise WeightsError(
-            f"{path} is not a complete checkpoint ({first_line(error)}): delete it"
+            f"the checkpoint {path} is damaged ({first_line(error)}): delete it to start again"
         ) from None
     return tensors, json.loads(header["state"])
 
@@ -65,7 +65,8 @@ def restore(
 ) -> None:
     """Restore a network, its moving average and its optimisers from a checkpoint of the same run.
 
-    The shapes must match: a fused optimiser would write past the end of moments of another shape.
+    The caller makes sure that it is the same run. Shapes of moments are not checked here, and a
+    fused optimiser would write past the end of a moment that is too small.
     """
     for kind, module in (("network", network), ("average", average)):
         module.load_state_dict({name: tensors[f"{kind}.{name}"] for name in module.state_dict()})
@@ -84,7 +85,10 @@ def restore(
 
 
 def _like(value: Tensor, parameter: Tensor) -> Tensor:
-    """Copy a moment to its parameter's device and memory layout, since fused Adam requires both."""
+    """Copy an optimiser's moment to the device of its parameter.
+
+    A moment with the parameter's shape also gets its memory layout, which fused Adam requires.
+    """
     if value.shape == parameter.shape:
         return torch.empty_like(parameter).copy_(value)
     return value.to(parameter.device, copy=True)

@@ -38,10 +38,11 @@ from .views import (
 
 
 class FolderSource:
-    """Images in files, and their labels as 1-bit PNG files in a subfolder per label settings.
+    """Images in files, with their labels as 1-bit PNG files.
 
-    A label's file name holds a digest of the image, so a replaced image gets a new label. Views are
-    kept in memory up to `memory_bytes`. Further views are rendered each time.
+    Each choice of label settings has its own subfolder of `labels`. The name of a label file holds
+    a digest of the image, so a replaced image gets a new label. Views are kept in memory up to
+    `memory_bytes` in all. Further views are rendered each time they are loaded.
     """
 
     shard_sizes = None
@@ -64,10 +65,10 @@ class FolderSource:
         return self.images[index]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_kept": {}}  # a spawned process keeps its own views
+        return {**self.__dict__, "_kept": {}}  # a spawned process starts without kept views
 
     def label_path(self, image: SourceImage, view: View) -> Path:
-        """Return the path of the label of a view."""
+        """Return the path of the label file of a view."""
         return self.label_folder / f"{image.path.stem}_{image.digest}_{view.name}.png"
 
     def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +79,8 @@ class FolderSource:
         image, mask = render(source.path, view), load_mask(self.label_path(source, view))
         if mask.shape != image.shape[:2]:
             raise ImageError(
-                f"the label of {source.path} has another size: delete {self.label_folder}"
+                f"the label of {source.path} does not have the size of its view: delete the "
+                f"folder of labels {self.label_folder}"
             )
         self._keep(index, view, image, mask)
         return image, mask
@@ -91,9 +93,9 @@ class FolderSource:
     def make_labels(
         self, views: Sequence[tuple[View, ...]], workers: int | None = None, quiet: bool = True
     ) -> int:
-        """Make the missing labels of the `views` of each image in parallel; return their number.
+        """Make the missing labels of each image's `views`, in parallel; return their number.
 
-        The rendered views are kept in memory as far as they fit.
+        The rendered views are kept in memory as far as they fit into `memory_bytes`.
 
         Raises:
             BatchError: images cannot be read. The labels of all other images are made.
@@ -102,7 +104,9 @@ class FolderSource:
         for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
             files = {view: self.label_path(image, view) for view in needed}
             if missing := {view: path for view, path in files.items() if not path.exists()}:
-                memory -= sum(4 * view.short_side**2 for view in missing)  # lower bound
+                memory -= sum(
+                    4 * view.short_side**2 for view in missing
+                )  # a lower bound of the bytes
                 tasks.append((index, image.path, missing, memory > 0))
         total = sum(len(missing) for _, _, missing, _ in tasks)
         failures = []
@@ -115,22 +119,25 @@ class FolderSource:
                 bar.update(len(missing))
         if failures:
             raise BatchError(
-                f"{len(failures)} of {len(self.images)} images cannot be read, others are kept",
+                f"{len(failures)} of {len(self.images)} images cannot be read (the labels of the "
+                "others are kept)",
                 failures,
             )
         return total
 
 
 LabelTask = tuple[int, Path, dict[View, Path], bool]
-"""Index and file of an image, the label files to write, and whether to return its views."""
+"""The work on one image: its index and file, the label file to write for each view, and whether
+`_make_labels` returns the rendered views."""
 
 
 def _make_labels(
     task: LabelTask, options: LabelOptions
 ) -> tuple[LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
-    """Write the labels of an image; return the task, its views with labels, and an error text.
+    """Write the labels of an image; return the task, the rendered views, and an error message.
 
-    The error text is empty if the image can be read.
+    The views have their labels, and are returned only if the task asks for them. The message is
+    empty if the image can be read.
     """
     _, file, labels, keep = task
     made = {}
@@ -153,8 +160,8 @@ ImageSource = FolderSource | ShardSource
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
     """Random augmented crops of views, indexed by the `CropIndex` entries of a `CropSampler`.
 
-    An item is an image, (crop, crop, 3) uint8 RGB, and its labels, (crop, crop) bool. It depends
-    only on its index and the seed of the options.
+    An item is a cropped image, (crop, crop, 3) uint8 RGB, and its label, (crop, crop) bool. All
+    random choices depend only on the index and the seed of the options.
     """
 
     def __init__(self, source: ImageSource, options: TrainingOptions) -> None:
@@ -182,7 +189,7 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
     def _choose_view(
         self, image: SourceImage, stage: Stage, generator: np.random.Generator
     ) -> View:
-        """Choose normal or dark light at random, then one of the stage's sizes."""
+        """Choose normal or dark light at random, then a view with a size that the stage crops."""
         dark = generator.random() < self.options.dark_fraction
         fitting = [
             view
@@ -195,7 +202,7 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
 class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
     """Whole images, (H, W, 3) uint8 RGB, with (H, W) bool labels.
 
-    Images in normal light come first, then darkened ones.
+    Each image comes twice: all images in normal light come first, then all of them darkened.
     """
 
     def __init__(self, source: ImageSource) -> None:
@@ -212,7 +219,7 @@ class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Training and validation images of a run, and their digest."""
+    """Training and validation images of a run, and a digest of all of them."""
 
     training: ImageSource
     validation: ImageSource
@@ -232,8 +239,8 @@ def prepare_data(
 ) -> TrainingData:
     """List the images of a run, and make the missing labels of their views.
 
-    The arguments are those of `train`. `processes` is the number of loading processes, each of
-    which keeps its own views in memory.
+    The arguments are those of `train`. `processes` is the number of processes that load crops. Each
+    of them keeps its own views, so they share the memory.
     """
     images, output = Path(images), Path(output)
     folder = output / "labels" if labels is None else Path(labels)
@@ -265,10 +272,10 @@ def prepare_data(
 
 @contextlib.contextmanager
 def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
-    """Yield an iterator over a loader, and raise errors of its processes unchanged.
+    """Yield an iterator over a loader's batches, and raise errors of its processes unchanged.
 
-    OpenCV uses one thread in this context, because a forked process cannot use its parent's
-    threads.
+    If the loader has processes, OpenCV uses one thread in this context, because a forked process
+    cannot use the threads of its parent.
     """
     batches: Any = None
     try:
@@ -276,13 +283,14 @@ def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
             batches = iter(loader)
             yield batches
     except DeepDetectError as error:
-        # torch puts the whole traceback of the process into the message.
+        # torch raises an error of a process again, with the whole traceback as its message.
         text = str(error).strip()
         if not text.startswith("Caught "):
             raise
         raise type(error)(text.splitlines()[-1].partition(": ")[2]) from None
     finally:
-        # torch ends the processes when the iterator is deleted, but an error keeps it alive. The
-        # garbage collector would take five seconds, because it collects their queues first.
+        # torch ends the processes when the iterator is deleted, but the traceback of an error keeps
+        # the iterator alive. Later the garbage collector would delete the queues of the processes
+        # first, and ending the processes would then take five seconds.
         if loader.num_workers and batches is not None:
             batches._shutdown_workers()

@@ -1,4 +1,4 @@
-"""Training of the detector network on labelled crops with a loss per pixel."""
+"""Training of the detector network on labelled crops, with a cross-entropy for each pixel."""
 
 from __future__ import annotations
 
@@ -42,7 +42,10 @@ ONNX = "deepdetect.onnx"
 def initial_network(
     options: TrainingOptions, init_weights: InitWeights | None
 ) -> tuple[TrainingOptions, nn.Module]:
-    """Make the network with its initial weights, and set options that depend on the weights."""
+    """Return the completed options, and the network with its initial weights.
+
+    If `frozen_batch_norm` is None, it becomes true with trained initial weights, else false.
+    """
     make = look_up("network", options.network, NETWORKS)
     if init_weights is not None:
         if options.frozen_batch_norm is None:
@@ -52,26 +55,30 @@ def initial_network(
         network = average_weights(paths)
         if type(network) is not make:
             raise OptionError(
-                f"the initial weights are not of the network {options.network}: give others, or "
-                "another `network`"
+                f"the initial weights do not belong to the network {options.network}: give other "
+                "`init_weights`, or another `network`"
             )
         return options, network
     if options.frozen_batch_norm:
         raise OptionError(
-            "`frozen_batch_norm` would keep the batch statistics of random weights: "
-            "give trained ones as `init_weights`, or leave it out"
+            "`frozen_batch_norm` keeps the batch statistics of the initial weights, and those of "
+            "random weights are useless: give trained `init_weights`, or leave the option out"
         )
     return dataclasses.replace(options, frozen_batch_norm=False), seeded(make, options.seed)
 
 
 class DenseTrainer(Trainer):
-    """Training of a network from images to heat maps, on labelled images."""
+    """Training of a network that maps images to heat maps of keypoints, on labelled images."""
 
     objective, sign = "validation_loss", 1
-    purpose = "that maps RGB in [0, 1] to the probability that a label detector marks a pixel"
+    purpose = (
+        "that maps an RGB image, with values in [0, 1], to the probability of each pixel to be "
+        "marked by a label detector"
+    )
     measures = (
-        "On the validation images, in normal light and darkened: mean binary cross-entropy per "
-        "pixel, and intersection over union at 0.5"
+        "On the validation images, in normal light and darkened: the mean binary cross-entropy "
+        "per pixel, and the intersection over union of the label and the pixels with a "
+        "probability above 0.5"
     )
     weights_file = "best.safetensors"
 
@@ -93,7 +100,7 @@ class DenseTrainer(Trainer):
         self.bfloat16 = device.precision == "bfloat16" or (
             device.precision == "auto" and _computes_bfloat16(kind)
         )
-        # channels_last is 40 % faster on CPUs, and suits tensor cores.
+        # The memory format channels_last is 40 % faster on CPUs, and suits tensor cores.
         self.network = network.to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval()
@@ -113,13 +120,13 @@ class DenseTrainer(Trainer):
         if self.compiled:
             self.introduction.append(
                 "the first step of each stage compiles the network, which takes minutes on two "
-                "cores; --no-compile starts at once, and each step takes longer"
+                "cores; with --no-compile, training starts at once, but each step takes longer"
             )
 
     def _set_up(self) -> nn.Module:
         if not self.compiled:
             return self.network
-        # Each stage has one input shape, for which it gets its own code.
+        # Each stage has one input shape, for which torch compiles separate code.
         return torch.compile(self.network, dynamic=False)  # type: ignore[return-value]
 
     def to_device(self, values: Tensor) -> Tensor:
@@ -131,7 +138,7 @@ class DenseTrainer(Trainer):
         return self.to_device(images).permute(0, 3, 1, 2).float().div_(255)
 
     def logits(self, images: Tensor) -> Tensor:
-        """Run the network on images for training; return float32 logits (B, 1, H, W)."""
+        """Run `network` on (B, 3, H, W) float32 images; return float32 logits (B, 1, H, W)."""
         try:
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
                 return self._forward(images).float()
@@ -146,16 +153,16 @@ class DenseTrainer(Trainer):
             return self.logits(images)
 
     def device_memory_bytes(self) -> int:
-        """Return the peak memory of torch on the GPU, 0 on the CPU."""
+        """Return the peak memory that torch has used on the GPU, in bytes; 0 on the CPU."""
         return torch.cuda.max_memory_allocated() if self.device.type == "cuda" else 0
 
     def describe(self) -> str:
-        """Return a text with the device and precision, and whether the network is compiled."""
+        """Describe, for the log, the device, the precision and whether the network is compiled."""
         precision = "bfloat16" if self.bfloat16 else "float32"
         return f"{self.device.type}, {precision}, {'compiled' if self.compiled else 'eager'}"
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
+        """Return a loader of the batches (images, labels) for steps `first` to `last` - 1."""
         sampler = CropSampler(self.schedule, self.data.training.shard_sizes, first, last)
         return self._loader(CropDataset(self.data.training, self.options), batch_sampler=sampler)
 
@@ -164,7 +171,8 @@ class DenseTrainer(Trainer):
             dataset,
             num_workers=self.device_options.worker_count,
             pin_memory=self.device.type == "cuda",
-            generator=torch.Generator(),  # torch's own would change the user's random state
+            # torch's default generator would change the user's random state.
+            generator=torch.Generator(),
             **batches,
         )
 
@@ -175,7 +183,7 @@ class DenseTrainer(Trainer):
         return self.schedule.learning_rate(step)
 
     def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
-        """Return the loss of (B, crop, crop, 3) uint8 RGB with (B, crop, crop) bool labels."""
+        """Return the loss of images (B, crop, crop, 3) uint8 with labels (B, crop, crop) bool."""
         images, masks = batch
         self.network.train()
         if self.options.frozen_batch_norm:
@@ -185,9 +193,10 @@ class DenseTrainer(Trainer):
         return binary_cross_entropy_with_logits(logits, truth, pos_weight=self._pos_weight(images))
 
     def _pos_weight(self, images: Tensor) -> Tensor | None:
-        """Return the loss weight of marked pixels in each image, (B, 1, 1, 1) or (1,).
+        """Return the weight that the loss gives to pixels that are marked in the labels.
 
-        None means that all weights are 1.
+        It has the shape (B, 1, 1, 1), one weight for each image, or (1,), one for all images. None
+        means that all weights are 1.
         """
         normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
         if dark is None or dark == normal:  # the weight does not depend on the visibility
@@ -232,7 +241,10 @@ class DenseTrainer(Trainer):
 
 
 def freeze_batch_norm(network: nn.Module) -> None:
-    """Make batch normalisations use their running statistics until `network.train()` is called."""
+    """Make batch normalisations use running statistics instead of those of the batch.
+
+    This lasts until `network.train()` is called.
+    """
     for module in network.modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             module.eval()

@@ -1,8 +1,8 @@
 """Training of the match filter, which separates correct and wrong matches by their neighbours.
 
-Each sample is a pair of views of a synthetic scene, or now and then of two unrelated scenes. The
-keypoints are described by the learned descriptor or RootSIFT, and matched. The ground truth says
-which matches are correct.
+Each sample is a pair of views: usually of the same synthetic scene, sometimes of two unrelated
+scenes. Their keypoints are described by the learned descriptor or by RootSIFT, and matched. The
+scene is known, and so are the correct matches.
 """
 
 from __future__ import annotations
@@ -43,63 +43,61 @@ from .trainer import Trainer, digests, seeded, with_plateau
 ONNX = "match_filter.onnx"
 
 WIDTH, ROUNDS = 32, 3
-"""The first is the number of features of a match. The second is the number of rounds of message
-passing between neighbouring matches. Both are chosen by hand."""
+"""The network has `WIDTH` hidden features for each match, and `ROUNDS` rounds of message passing
+between neighbouring matches. Both are chosen by hand."""
 
 OF_A_MATCH, OF_TWO = 4, 11
-"""The first is the number of input features of a match, the second that of a pair of neighbours."""
+"""Numbers of input features: `OF_A_MATCH` for a match, `OF_TWO` for a match and a neighbour."""
 
 RATIO_RANGE, RATIO_SCALE, RATIO_OFFSET = (0.05, 1.2), 3, 0.5
-"""Distance ratios of the ratio test are clipped to this range. The logarithm of the ratio is scaled
-and shifted to a mean near 0 and a standard deviation near 1. Mutual matches can have ratios above
-1."""
+"""The distance ratio of a match, as in the ratio test, is clipped to `RATIO_RANGE`. Its logarithm
+is multiplied by `RATIO_SCALE` and shifted by `RATIO_OFFSET`, so that the mean is near 0 and the
+standard deviation near 1."""
 
 MEAN_COSINE = 0.7
-"""Approximate mean cosine of the rotation between matched keypoints. It is subtracted, so that the
-feature has a mean near 0."""
+"""Approximate mean of an input feature, the cosine of the rotation between matched keypoints. It is
+subtracted from the feature, so that the mean becomes about 0."""
 
 LEAST_TRUST = 0.5
-"""This is added to the sum of the neighbours' weights. So their weighted mean is near 0 if all
-weights are near 0. Chosen by hand."""
+"""The weighted sum of the neighbours' messages is divided by the sum of the weights plus this
+number. So the result is near 0 if all weights are near 0. Chosen by hand."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
-"""The views are squares with the first number of pixels a side, and have at most the second number
-of keypoints. A pair has at least the third number of matches, one more than a match has
-neighbours."""
+"""The views are squares with `SIDE_PX` pixels a side, and have at most `KEYPOINTS` keypoints each.
+A pair has at least `LEAST_MATCHES` matches, one more than the number of neighbours of a match
+(`AROUND`)."""
 
 UNRELATED = 7
-"""Every 7th pair shows two unrelated photographs. The two descriptors alternate, so the number is
-odd to give unrelated pairs to both."""
+"""Every 7th pair shows two unrelated scenes. Pairs use the two descriptors in turn. The number is
+odd, so that unrelated pairs occur with each descriptor."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
-"""Matches with an error below the first distance are correct, those with an error above the second
-are wrong. Matches in between are ignored, because the ground truth is only accurate to a pixel or
-two."""
+"""A match with an error below `RIGHT_PX` is correct. A match with an error above `WRONG_PX` is
+wrong. Matches in between are ignored, because the ground truth has errors of a pixel or two."""
 
 WARM_UP_STEPS, DECAY_SHARE = 50, 0.7
-"""The learning rate rises over these steps, and falls linearly to 0 over this last share of the
-steps. Chosen by hand."""
+"""The learning rate rises over the first `WARM_UP_STEPS` steps. Over the last share `DECAY_SHARE`
+of the steps it falls linearly to 0. Chosen by hand."""
 
 WEIGHT_DECAY = 0.01
-"""Weight decay, the default of AdamW."""
+"""Weight decay of AdamW, the default of torch."""
 
 LEFT_OUT_SHARE, FEWEST_SHARE = 0.5, 0.02
-"""The first is the share of the pairs in which some matches are randomly left out. The second is
-the smallest share of matches that stay. It is only 2 %, since the filter is meant for pairs with
-few matches."""
+"""Matches are left out at random in the share `LEFT_OUT_SHARE` of the pairs. At least
+`FEWEST_SHARE` of them stay: only 2 %, since the filter is meant for pairs with few matches."""
 
 TURNED_SHARE = 0.3
-"""Share of the pairs of which both images are rotated together by any angle. Chosen by hand."""
+"""Share of the pairs in which both images are rotated by the same random angle. Chosen by hand."""
 
 VALIDATION_SEED = 1
-"""Seed of the validation pairs, which does not depend on the seed of the run."""
+"""Seed of the validation pairs. It is the same for all seeds of the training."""
 
 Sample = tuple[dict[str, np.ndarray], np.ndarray]
-"""Inputs of the network, and the error of each match in pixels."""
+"""One pair of views: the inputs of the network by name, and the error of each match in pixels."""
 
 
 class MatchFilter(nn.Module):
-    """A network that maps matches and their neighbours to the logits that they are correct."""
+    """A network that returns, for each match, the logit of the probability that it is correct."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -124,10 +122,11 @@ class MatchFilter(nn.Module):
         ratios: Tensor,
         around: Tensor,
     ) -> Tensor:
-        """Return the (M,) logits that matches are correct.
+        """Return the logits (M,) of matches, positive if a match is more likely correct than wrong.
 
-        The inputs are positions (M, 2) and sizes (M,) in pixels in both images, rotations (M,) in
-        radians, distance ratios (M,), and the rows (M, 2 K) of the neighbours in both images.
+        The inputs are positions (M, 2) and sizes (M,) of the matched keypoints in both images, in
+        pixels. Then come the rotations (M,) between them in radians, and the distance ratios (M,).
+        `around` (M, 2 K) holds the rows of each match's K nearest matches in each of the images.
         """
         growth, cosine, sine = (sizes1 / sizes0).log(), turns.cos(), turns.sin()
         distinct = RATIO_SCALE * ratios.clamp(*RATIO_RANGE).log() + RATIO_OFFSET
@@ -148,29 +147,30 @@ class MatchFilter(nn.Module):
     ) -> Tensor:
         """Return (M, 2 K, 11) features of each match relative to its K neighbours in each image.
 
-        They are offsets, in units of the median distance to the neighbours, and logarithms of
-        scale changes.
+        The first eight are offsets to the neighbour, in units of the typical distance of
+        neighbours, with large values compressed. The last three are logarithms of scale changes.
         """
         there0, there1 = xy0[around] - xy0[:, None], xy1[around] - xy1[:, None]
         away0, away1 = (each.square().sum(2).sqrt() for each in (there0, there1))
         middle = AROUND // 2
         unit = (away0[:, middle] * away1[:, AROUND + middle]).sqrt()[:, None, None] + 1
-        # Offsets in the second image, predicted from the size and angle of the match itself.
+        # Offsets to the neighbours in the second image, as the size change and rotation of the
+        # match itself predict them from the first image.
         (x, y), c, s = there0.unbind(2), cosine[:, None], sine[:, None]
         expected = torch.stack([c * x - s * y, s * x + c * y], 2) * growth.exp()[:, None, None]
         lengths = [there0, there1, 2 * (there1 - there0), 2 * (there1 - expected)]
         stretch = ((away1 + 1) / (away0 + 1)).log()
         growths = [stretch, growth[:, None] - stretch, growth[around] - growth[:, None]]
         scaled = torch.cat(lengths, 2) / unit
-        # This is the inverse hyperbolic sine, because the ONNX exporter lacks it.
+        # This is the inverse hyperbolic sine, written out because the ONNX exporter lacks it.
         scaled = scaled.sign() * (scaled.abs() + (scaled * scaled + 1).sqrt()).log()
         return torch.cat([scaled, torch.stack(growths, 2)], 2)
 
 
 def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
-    """Draw a pair of views, describe and match their keypoints, and return features and errors.
+    """Draw a pair of views, match their keypoints, and return the network's inputs and the errors.
 
-    The pair only depends on the files, the seed and its number.
+    The pair depends only on the files, the seed and its number.
     """
     rng = np.random.default_rng([seed, number])
     detector = PointDetector(KEYPOINTS, descriptor=(LEARNED, ROOT_SIFT)[number % 2])
@@ -191,8 +191,8 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
         if number % UNRELATED:
             there, _, seen = correspond(layers, tops, xy0)
             errors[seen] = np.linalg.norm(there - xy1, axis=1)[seen]
-            # Beyond its border, the photograph is mirrored. Matches there get an error that is
-            # ignored, because they may be correct or wrong.
+            # Views show the photograph mirrored beyond its border. Matches in a mirrored area may
+            # be correct or wrong, so they get an error between the limits, which is ignored.
             row, column = np.rint(xy0).astype(int).clip(0, SIDE_PX - 1).T[::-1]
             for k, layer in enumerate(layers):
                 place = layer.views[0].to_photograph(xy0)
@@ -205,7 +205,7 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
 
 
 def draw_samples(files: Sequence[Path], seed: int, count: int, quiet: bool = True) -> list[Sample]:
-    """Draw pairs of views in parallel. Each only depends on the seed and its number."""
+    """Draw pairs of views in parallel. Each pair depends only on the files, seed and its number."""
     made = []
     with progress(count, "drawing pairs", "pair", quiet) as bar:
         for sample in map_in_processes(partial(draw_sample, files, seed), range(count)):
@@ -225,7 +225,7 @@ def mutual_matches(features0: Keypoints, features1: Keypoints) -> DescriptorMatc
 
 
 def vary(rng: np.random.Generator, sample: Sample) -> Sample:
-    """Randomly leave out matches, and mirror, rotate and swap the images of a pair."""
+    """Randomly leave out matches of a pair, and mirror, rotate and swap its images."""
     values, errors = sample
     values = {name: each for name, each in values.items() if name != "around"}
     if rng.random() < LEFT_OUT_SHARE:
@@ -260,12 +260,12 @@ def join(samples: Sequence[Sample]) -> tuple[list[Tensor], Tensor]:
 
 
 def known(errors: Tensor) -> Tensor:
-    """Return which matches are clearly correct or clearly wrong by their errors in pixels."""
+    """Return a mask of the matches that are clearly correct or wrong, by their errors in pixels."""
     return (errors < RIGHT_PX) | (errors > WRONG_PX)
 
 
 class BatchDataset(Dataset[tuple[list[Tensor], Tensor]]):
-    """The batch of each step: randomly varied pairs that only depend on the seed and the step."""
+    """The batch of each step: random pairs, randomly varied. The seed and the step determine it."""
 
     def __init__(self, samples: Sequence[Sample], options: MatchFilterTrainingOptions) -> None:
         self.samples, self.options = samples, options
@@ -277,14 +277,15 @@ class BatchDataset(Dataset[tuple[list[Tensor], Tensor]]):
 
 
 class MatchFilterTrainer(Trainer):
-    """Training of the match filter on views of images."""
+    """Training of the match filter on pairs of synthetic views of images."""
 
     objective, sign = "validation_loss", 1
     purpose = "that separates correct matches from wrong ones"
     measures = (
-        "On pairs of views of the validation images: the cross-entropy, and of the matches that a "
-        "ratio test, the filter, and the filter made as precise as that keep, how many are right, "
-        "their precision, and those of unrelated views"
+        "On pairs of views of the validation images: the cross-entropy, and measures of the "
+        "matches that are kept by a ratio test, by the filter, and by the filter at the threshold "
+        "where it is as precise as the ratio test. The measures are the number of correct matches, "
+        "the precision, and the number of matches that are kept between unrelated views"
     )
     weights_file = "match_filter.safetensors"
     max_gradient_norm = 1.0
@@ -312,7 +313,7 @@ class MatchFilterTrainer(Trainer):
         self.notes = {"images": str(len(images))}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return the loader of the batches of some steps, each as returned by `join`."""
+        """Return a loader of the batches for steps `first` to `last` - 1, as returned by `join`."""
         steps = range(first, self.steps if last is None else last)
         dataset = BatchDataset(self.samples, self.options)
         return DataLoader(dataset, batch_size=None, sampler=steps, generator=torch.Generator())
@@ -339,7 +340,7 @@ class MatchFilterTrainer(Trainer):
 
 
 RATIOS = {LEARNED: LEARNED_RATIO, ROOT_SIFT: RATIO}
-"""Thresholds of the ratio test with which the filter is compared, by descriptor."""
+"""Thresholds of the ratio test with which the filter is compared, for each descriptor."""
 
 WAYS = ("ratio test", "filter", "filter, as precise")
 MEASURES = ("right", "precision", "of unrelated views")
@@ -347,9 +348,9 @@ MEASURES = ("right", "precision", "of unrelated views")
 
 @torch.no_grad()
 def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]:
-    """Return the loss, and measures of the ratio test and the filter on validation pairs.
+    """Return the loss on validation pairs, and measures of the ratio test and of the filter.
 
-    The filter is measured at logit 0, and at the threshold where it is as precise as the ratio
+    The filter is measured at two thresholds: at logit 0, and where it is as precise as the ratio
     test.
     """
     found, losses = {}, []

@@ -10,30 +10,31 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 BETA = 0.95
-"""Decay of the running means of `Soap`, as in its paper, and of the momentum of `Muon`."""
+"""Decay per step of the running means of `Soap`, as in its paper, and of the momentum of `Muon`."""
 
 EPS = 1e-8
 PRECONDITION_FREQUENCY = 10
 """Number of steps between updates of the eigenbasis of `Soap`."""
 
 NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)
-"""Coefficients of the polynomial whose iteration maps singular values to near 1 (Keller Jordan,
-"Muon"), in ascending order of the powers 1, 3 and 5."""
+"""Coefficients of the powers 1, 3 and 5 in a polynomial. Applied to singular values again and
+again, it moves them close to 1 (Keller Jordan, "Muon")."""
 
 NEWTON_SCHULZ_STEPS = 5
 MUON_RMS = 0.2
-"""Root mean square of a Muon step in units of the learning rate, about as large as that of an Adam
-step (arXiv:2502.16982)."""
+"""Root mean square of the elements of a Muon step, in units of the learning rate. It is about as
+large as that of an Adam step (arXiv:2502.16982)."""
 
 MUON_WEIGHT_DECAY = 0.01
 INITIAL_POWER_ITERATIONS = 3
-"""Number of power iterations for the first eigenbasis, which start from the axes."""
+"""Number of power iterations for the first eigenbasis of `Soap`, starting from the identity."""
 
 
 def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
     """Make the optimisers that together train a network's parameters.
 
-    "adam" uses Adam; "soap" uses SOAP for kernels, and Adam for biases and other vectors.
+    The name "adam" gives Adam. "soap" gives SOAP for kernels, and Adam for biases and other
+    vectors.
     """
     if name == "adam":
         return [torch.optim.Adam(network.parameters(), fused=True)]
@@ -43,10 +44,11 @@ def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
 
 
 class KernelOptimizer(Optimizer):
-    """An optimiser of matrices and kernels. A kernel is a matrix with a row per output channel.
+    """An optimiser of matrices and convolution kernels.
 
-    The whole state consists of tensors per parameter. So safetensors can store it, and a resumed
-    run is bit-identical.
+    A kernel is treated as a matrix with one row for each output channel. The state of the optimiser
+    consists of tensors only. So safetensors can store all of it, and a resumed run is
+    bit-identical.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 1e-3) -> None:
@@ -68,8 +70,9 @@ class KernelOptimizer(Optimizer):
 class Soap(KernelOptimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 
-    The first step only computes the first eigenbasis. The version of pytorch-optimizer is not used,
-    because its state holds lists and numbers, and it has a basis for each axis of a kernel.
+    The first step only computes the first eigenbasis, and does not change the parameter. The
+    package pytorch-optimizer also has SOAP. It is not used, because its state holds lists and
+    numbers, and it has a basis for each of a kernel's axes instead of two.
     """
 
     def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
@@ -77,7 +80,7 @@ class Soap(KernelOptimizer):
         if not state:
             state.update(_initial_state(gradient))
             return
-        state["step"] = state["step"].cpu() + 1  # restored on the GPU by a checkpoint
+        state["step"] = state["step"].cpu() + 1  # loading a checkpoint puts it on the GPU
         left, right = state["left_basis"], state["right_basis"]
         mean, square = state["exp_avg"], state["exp_avg_sq"]
         mean.lerp_(gradient, 1 - BETA)
@@ -103,7 +106,7 @@ def _update_basis(state: dict[str, Tensor], side: str, axis: int) -> None:
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
-    """Return the state of a parameter from its first gradient, a matrix."""
+    """Return the initial state for a parameter, computed from its first gradient, a matrix."""
     state = {
         "step": torch.zeros(()),
         "exp_avg": torch.zeros_like(gradient),
@@ -115,7 +118,8 @@ def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
         basis = torch.eye(len(state[side]), device=gradient.device)
         for _ in range(INITIAL_POWER_ITERATIONS):
             basis = torch.linalg.qr(state[side] @ basis)[0]
-        # Contiguous, as restored from a checkpoint, because rounding depends on the layout.
+        # A basis from a checkpoint is contiguous. This one is made contiguous as well, because the
+        # rounding in products depends on the layout.
         state[f"{side}_basis"] = basis.contiguous()
     return state
 

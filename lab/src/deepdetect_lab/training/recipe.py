@@ -25,7 +25,8 @@ class Stage:
         crop: side of the square crops in pixels, a multiple of 8.
         batch: number of crops per batch.
         epochs: number of times that each image is used.
-        sides: shorter sides of the views to crop; default: all that are large enough.
+        sides: shorter sides of the views from which crops are taken. Empty: all views that are
+            large enough.
     """
 
     crop: int
@@ -35,17 +36,20 @@ class Stage:
 
     def __post_init__(self) -> None:
         if self.crop < 16 or self.crop % 8:
-            raise OptionError(f"crop must be a multiple of 8 from 16 on, not {self.crop}")
+            raise OptionError(f"`crop` must be a multiple of 8, at least 16, not {self.crop}")
         if self.batch < 1 or self.epochs < 1:
-            raise OptionError("a stage needs a batch and a number of epochs of at least 1")
+            raise OptionError("`batch` and `epochs` of a stage must be at least 1")
         if self.sides and min(self.sides) < self.crop:
             raise OptionError(
-                f"a crop of {self.crop} pixels does not fit into views of {min(self.sides)}"
+                f"a crop of {self.crop} pixels does not fit into views with a shorter side of "
+                f"{min(self.sides)}"
             )
 
     @classmethod
     def parse(cls, text: str) -> Stage:
-        """Read a stage from a text CROPxBATCHxEPOCHS, or with @SIDE,SIDE for views of some sizes.
+        """Read a stage from a text of the form CROPxBATCHxEPOCHS or CROPxBATCHxEPOCHS@SIDE,SIDE.
+
+        With SIDE, crops are taken only from views with these shorter sides.
 
         Example:
             >>> Stage.parse("240x16x40@240")
@@ -57,8 +61,8 @@ class Stage:
             chosen = tuple(int(part) for part in sides.split(",")) if at else ()
         except ValueError:
             raise OptionError(
-                f"a stage has the form CROPxBATCHxEPOCHS, such as 240x16x40, or 240x16x40@360 for "
-                f"views of one size, not {text!r}"
+                f"a stage has the form CROPxBATCHxEPOCHS, such as '240x16x40', or '240x16x40@360' "
+                f"to crop only views with a shorter side of 360 pixels, not {text!r}"
             ) from None
         return cls(crop, batch, epochs, chosen)
 
@@ -66,41 +70,47 @@ class Stage:
 @suggest_keywords
 @dataclass(frozen=True)
 class TrainingOptions:
-    """Options of a training that change the resulting weights.
+    """Options for training the detector network that change the resulting weights.
 
     Attributes:
         network: name of the network: "fast" or "espnet".
-        stages: stages of the training in order. Crops of whole views show everything on which the
-            label depends, because Harris and Sobel labels are relative to the image's largest
-            response; the global term of `fast` needs them. Smaller crops make steps cheaper.
-        interleave: mix the steps of all stages evenly, so that every size is used until the end.
-        short_sides: sizes in pixels to which the shorter side of images is scaled. Crops are taken
-            from all views that are large enough. The first size is used for validation.
+        stages: stages of the training in order. A crop should be as large as its view, because
+            Harris and Sobel labels are relative to the largest response in the whole image, and
+            `fast` uses statistics of the whole image. Smaller crops make steps cheaper.
+        interleave: mix the steps of all stages evenly, so that crops of every size are used until
+            the end.
+        short_sides: sizes in pixels to which the shorter side of each image is scaled, one view for
+            each size. Crops are taken from all views that are large enough for the stage. The first
+            size is used for validation.
         square: make images square: "crop" takes the central square, "squash" resizes without
-            keeping the aspect ratio, as in the paper. None: keep the shape.
+            keeping the aspect ratio, as in the paper. None: keep the aspect ratio.
         max_images: use at most this many images, including those for validation.
-        val_fraction: fraction of the images held out for validation if no folder is given.
+        val_fraction: fraction of the images held out for validation, if there is no folder of
+            validation images.
         dark_fraction: fraction of darkened crops (paper: a quarter).
-        augmentations: number of augmented views of each image at the first size, for normal and for
-            dark light: rotated, relit, blurred, noisy or compressed. Each is used as often as the
-            original view of a size.
-        transpositions: mirror crops along their diagonal, which only changes labels of BRISK; flips
-            would also change those of Shi-Tomasi, SIFT and ORB.
+        augmentations: number of augmented views of each image (rotated, relit, blurred, noisy or
+            compressed), in normal light and again in dark light. Their size is the first of
+            `short_sides`. Each is used as often as the original view of a size.
+        transpositions: mirror half of the crops along their diagonal. Only BRISK would label a
+            mirrored crop differently. Flips would also change labels of Shi-Tomasi, SIFT and ORB.
         color_jitter: fraction of the crops whose colours are removed or rotated. The luma, on which
             labels and `fast` depend, changes by at most one grey level.
         optimizer: "adam", or "soap", which learns more per image (measurements: lab/HISTORY.md).
-        learning_rate: learning rate at the start of the cosine annealing to 1e-6.
-        warm_up: fraction of the steps over which the learning rate rises from zero. Trained initial
-            weights need it, because the first steps of Adam have poor moments and would undo much.
-        average_decay: decay per step of the exponential average of the weights, which is validated
-            and saved; 0 takes the weights themselves.
+        learning_rate: learning rate at the start of cosine annealing, which ends at 1e-6.
+        warm_up: fraction of the steps over which the learning rate rises from zero. It protects
+            trained initial weights: in the first steps, Adam has seen too few gradients to choose
+            good step sizes, and would undo much of the earlier training.
+        average_decay: decay per step of the exponential average of the weights; the average is
+            validated and saved, and with 0 it equals the weights.
         max_gradient_norm: gradients with a larger norm are scaled down to it; None: no limit.
-        frozen_batch_norm: normalise by the batch statistics of the initial weights, because those
-            of small batches vary much. None: only if the initial weights are trained.
-        pos_weight: weight of marked pixels in the loss. With 1 the network marks too few pixels
-            where it is uncertain, since most pixels are not marked. Above 1 it finds more keypoints
-            at a probability of 0.5.
-        low_light_pos_weight: weight of marked pixels in crops of low visibility. None: the same.
+        frozen_batch_norm: normalise by the batch statistics stored with the initial weights,
+            because the statistics of small batches vary much. None: only if the initial weights are
+            trained.
+        pos_weight: weight in the loss of pixels that are marked in the label. With 1, the network
+            marks too few pixels where it is uncertain, since most pixels are not marked. Above 1,
+            more pixels reach a probability of 0.5.
+        low_light_pos_weight: weight of marked pixels in crops of low visibility. None: as in all
+            other crops.
         labels: the label detectors and their settings.
         val_count: number of validations.
         seed: seed of the initial weights, the order of the images, the crops and their
@@ -161,17 +171,19 @@ class TrainingOptions:
 
     def _check_sizes(self) -> None:
         if not self.stages or not self.short_sides or min(self.short_sides) < 16:
-            raise OptionError("give `stages`, and `short_sides` of at least 16 pixels")
+            raise OptionError(
+                "give one or more `stages` and `short_sides`, and no side below 16 pixels"
+            )
         for side in (side for stage in self.stages for side in stage.sides):
             if side not in self.short_sides:
                 raise OptionError(
-                    f"a stage takes views of {side} pixels, which are not among `short_sides` "
-                    f"({', '.join(map(str, self.short_sides))}): add them"
+                    f"a stage crops views with a shorter side of {side} pixels, which is not among "
+                    f"`short_sides` ({', '.join(map(str, self.short_sides))}): add it"
                 )
         largest = max(stage.crop for stage in self.stages)
         if largest > max(self.short_sides):
             raise OptionError(
-                f"a crop of {largest} pixels does not fit into images of "
+                f"a crop of {largest} pixels does not fit into views with a shorter side of "
                 f"{max(self.short_sides)}: make `short_sides` larger or the crops smaller"
             )
 
@@ -179,16 +191,16 @@ class TrainingOptions:
 @suggest_keywords
 @dataclass(frozen=True)
 class DeviceOptions:
-    """How the network runs, which does not change the recipe.
+    """Options for running the training on a machine; they are not a part of the recipe.
 
     Attributes:
         device: "auto" (CUDA if there is a GPU, else the CPU), "cpu" or "cuda".
-        precision: "float32", "bfloat16", or "auto", which is bfloat16 where the processor
-            computes with it.
-        compile: use torch.compile; by default if there is a C++ compiler.
-        threads: CPU threads of torch; by default torch's choice.
-        num_workers: number of processes that load and augment crops; 0: the training process does.
-            Default: 0 on a CPU; on a GPU one less than the number of processors.
+        precision: "float32", "bfloat16", or "auto", which is bfloat16 if the CPU or GPU computes
+            with it, else float32.
+        compile: use torch.compile; by default on a GPU, or if there is a C++ compiler.
+        threads: number of CPU threads of torch; by default torch's choice.
+        num_workers: number of processes that load and augment crops; with 0, the training process
+            does it itself. Default: 0 on a CPU; on a GPU one less than the number of processors.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -204,7 +216,7 @@ class DeviceOptions:
 
     @property
     def accelerator(self) -> str:
-        """The device, with "auto" resolved: "cpu" or "cuda"."""
+        """The device on which to train: "cpu" or "cuda", chosen here if `device` is "auto"."""
         if self.device != "auto":
             return self.device
         from torch.cuda import is_available
@@ -213,7 +225,7 @@ class DeviceOptions:
 
     @property
     def worker_count(self) -> int:
-        """The number of loading processes, with the default resolved."""
+        """The number of loading processes: `num_workers`, or its default if that is None."""
         if self.num_workers is not None:
             return self.num_workers
         return 0 if self.accelerator == "cpu" else max(1, processor_count() - 1)
@@ -222,15 +234,16 @@ class DeviceOptions:
 @suggest_keywords
 @dataclass(frozen=True)
 class PointsTrainingOptions:
-    """Options of a training of the keypoint ranker.
+    """Options for training the keypoint ranker.
 
     Attributes:
         steps: optimiser steps.
         pairs: pairs of views in each step.
         side: side of the square views, in pixels.
-        learning_rate: highest learning rate; cosine annealing to 2 % of it.
-        min_density, max_density: range of the budgets in keypoints per pixel, log-uniform.
-        val_count: number of validations after the start.
+        learning_rate: highest learning rate; cosine annealing ends at 2 % of it.
+        min_density, max_density: smallest and largest number of keypoints per pixel that the ranker
+            learns to choose. Each pair gets a number in between, log-uniformly distributed.
+        val_count: number of validations, besides one before the first step.
         val_pairs: number of validation pairs of each kind: zoom, blur, viewpoint, light.
         seed: seed of the weights and the pairs.
 
@@ -263,7 +276,7 @@ class PointsTrainingOptions:
 @suggest_keywords
 @dataclass(frozen=True)
 class DescriptorTrainingOptions:
-    """Options of a training of the learned descriptor.
+    """Options for training the learned descriptor.
 
     Attributes:
         steps: optimiser steps.
@@ -271,8 +284,8 @@ class DescriptorTrainingOptions:
         learning_rate: highest learning rate (of Muon), after the warm-up; it falls linearly to 0.
         val_count: number of validations.
         val_pairs: number of validation pairs of each kind: upright, rotated, zoomed.
-        cross_modal: simulate different sensors for the views of a pair: other mixtures of colour
-            channels, inverted or otherwise changed tones, or edges.
+        cross_modal: simulate that the two views of a pair come from different sensors: with other
+            mixtures of colour channels, with inverted or otherwise changed tones, or as edges.
         seed: seed of the weights and the pairs.
 
     Raises:
@@ -300,15 +313,16 @@ class DescriptorTrainingOptions:
 @suggest_keywords
 @dataclass(frozen=True)
 class MatchFilterTrainingOptions:
-    """Options of a training of the match filter.
+    """Options for training the match filter.
 
     Attributes:
         steps: optimiser steps.
-        pairs: pairs of views in each step, varied at random.
-        drawn: number of pairs of views drawn before the first step, from which steps choose.
+        pairs: pairs of views in each step, each varied at random.
+        drawn: number of pairs of views that are drawn before the first step. Each step takes its
+            pairs from these.
         learning_rate: highest learning rate, after the warm-up; it falls linearly to 0.
         val_count: number of validations.
-        val_pairs: pairs that the weights are measured on.
+        val_pairs: number of validation pairs.
         seed: seed of the weights and the pairs.
 
     Raises:
@@ -350,12 +364,13 @@ _ESPNET = TrainingOptions(
 )
 
 PRESETS: dict[str, TrainingOptions] = {
-    # Whole views of several sizes, in normal and dark light, with averaged weights.
+    # Crops are whole views of several sizes, in normal and dark light. Weights are averaged.
     "default": TrainingOptions(),
-    # Small crops come first. Images of several sizes keep their aspect ratio.
+    # Small crops come first, large ones later. The views have several sizes, and keep the aspect
+    # ratio of the images.
     "espnet": _ESPNET,
     # The paper's recipe (Section III-B): about 33,000 images to train on and 8,000 for validation,
-    # squashed to 480x480, a quarter of them darkened, 100 epochs in batches of 64.
+    # all squashed to 480x480. A quarter of the crops are darkened. 100 epochs in batches of 64.
     "paper": replace(
         _ESPNET,
         stages=(Stage(480, 64, 100),),
@@ -367,8 +382,8 @@ PRESETS: dict[str, TrainingOptions] = {
         color_jitter=0.0,
         val_count=20,
     ),
-    # For two-view geometry (the paper's second weights, Figure 8), with denser labels and only in
-    # normal light. It is meant to start from trained weights.
+    # For two-view geometry, like the paper's second weights (Figure 8): labels mark more pixels,
+    # and all views are in normal light. It is meant to start from trained weights.
     "dense": TrainingOptions(
         dark_fraction=0.0, labels=LABEL_SETTINGS["dense"], learning_rate=1.5e-3
     ),

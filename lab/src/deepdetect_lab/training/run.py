@@ -1,6 +1,6 @@
 """Train networks, and `profile` the speed of a run.
 
-Functions import torch when they run, so that other commands start faster.
+The functions import torch only when they are called, so that other commands start faster.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def train(
     workers: int | None = None,
     log: Log | None = None,
 ) -> TrainingResult:
-    """Train the network on a folder of images.
+    """Train the detector network on a folder of images.
 
     An interrupted run resumes from its last checkpoint if started again with the same options; the
     result is the same as without interruption. Labels are made in other processes, so a script must
@@ -56,20 +56,23 @@ def train(
         output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx,
             MODEL_CARD.md and the loss curves.
         options: the recipe.
-        validation: folder of other images. None: some of the images are held out.
-        labels: folder of the label cache. None: in `output`.
-        init_weights: weights to start from, .safetensors files or the bundled "default", "dense",
-            "free" or "espnet"; several are averaged. None: random weights by the seed.
-        device: how the network runs.
-        workers: processes that make labels. None: one per processor.
-        log: function for lines of text for the user; None also turns off progress bars.
+        validation: folder of other images for the validation. None: some of the images are held
+            out.
+        labels: folder in which labels are cached. None: a folder in `output`.
+        init_weights: weights to start from: .safetensors files, or the bundled weights "default",
+            "dense", "free" or "espnet"; several weights are averaged. None: random weights by the
+            seed.
+        device: device, precision, compilation and processes.
+        workers: number of processes that make labels. None: one per processor.
+        log: function that is called with each line of text for the user. None: there is no text,
+            and there are no progress bars.
 
     Returns:
         The weights' files and the loss curves.
 
     Raises:
         ImageError: a folder is missing or empty.
-        OptionError: the folder holds a run with other options, the initial weights are of another
+        OptionError: `output` holds a run with other options, the initial weights belong to another
             network, or `frozen_batch_norm` is set without trained initial weights.
         WeightsError: the initial weights are missing or do not fit.
         DeepDetectError: an image cannot be read.
@@ -97,24 +100,26 @@ def train_on_pairs(
     num_workers: int | None = None,
     log: Log | None = None,
 ) -> TrainingResult:
-    """Train on pairs of synthetic views generated from single images.
+    """Train a network on pairs of synthetic views of single images.
 
-    The options choose the network: keypoint ranker, learned descriptor, or match filter (a quarter
-    of an hour on two processors). An interrupted run resumes as in `train`.
+    The class of `options` chooses the network: the keypoint ranker, the learned descriptor, or the
+    match filter. A match filter takes a quarter of an hour on two processors. An interrupted run
+    resumes as in `train`.
 
     Args:
         images: folder of images, ideally with sides of about 480 pixels.
         validation: folder of other images, by which the best weights are chosen.
-        output: folder for checkpoint.safetensors, the best weights (of the ranker best.npz, else
-            safetensors and ONNX), MODEL_CARD.md and the curves.
+        output: folder for checkpoint.safetensors, the best weights (best.npz for a ranker, a
+            safetensors and an ONNX file otherwise), MODEL_CARD.md and the training curves.
         options: the recipe.
-        init_weights: initial weights of a descriptor (descriptor.safetensors). None: random by the
-            seed.
+        init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file.
+            None: random weights by the seed.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
-        num_workers: processes that generate pairs; 0: the training process does. None: 0 on a CPU;
-            with a GPU one less than the number of processors. A match filter draws its pairs
-            before training, on all processors.
-        log: function for lines of text for the user; None also turns off progress bars.
+        num_workers: number of processes that generate pairs; with 0, the training process does it
+            itself. None: 0, or one less than the number of processors for a descriptor on a GPU. A
+            match filter ignores this: it draws its pairs before training, on all processors.
+        log: function that is called with each line of text for the user. None: there is no text,
+            and there are no progress bars.
 
     Returns:
         The files of the weights, and the training curves. `PointDetector` reads the weights of
@@ -122,8 +127,8 @@ def train_on_pairs(
 
     Raises:
         ImageError: a folder is missing or empty.
-        OptionError: the folder holds a run with other options or images, or the images show
-            nothing.
+        OptionError: `output` holds a run with other options or images, or the images have too
+            little detail.
         WeightsError: the initial weights are missing or do not fit.
 
     Example:
@@ -153,7 +158,7 @@ def train_on_pairs(
 def _files(
     images: str | Path, validation: str | Path, output: str | Path
 ) -> tuple[list[Path], list[Path]]:
-    """List training and validation images, without the figures that the run writes."""
+    """List training and validation images, without the figures that runs write to `output`."""
     images, validation, output = Path(images), Path(validation), Path(output)
     return find_images(images, [output, validation]), find_images(validation, [output, images])
 
@@ -167,25 +172,24 @@ def _dense_trainer(
     log: Log | None = None,
     **data: Any,
 ) -> DenseTrainer:
-    """Make the labels and the trainer of the detector network.
+    """Make the missing labels, and return the trainer of the detector network.
 
-    `data` are further arguments of `train`.
+    `data` holds the arguments `validation`, `labels` and `workers` of `train`.
     """
     from .dataset import prepare_data
     from .dense import DenseTrainer, initial_network
 
     options, network = initial_network(
         options, init_weights
-    )  # raises its errors before labels are made
+    )  # comes first, so that its errors are raised before labels are made
     loading = max(1, device.worker_count)
     prepared = prepare_data(images, options, output, **data, processes=loading, quiet=log is None)
     return DenseTrainer(network, options, prepared, device)
 
 
 TIMED_STEPS, WARM_UP_STEPS = 30, 5
-"""The first is the number of steps of each stage that `profile` times. The second is the number of
-steps before these, in which networks are compiled, memory is allocated and first views are
-rendered."""
+"""`profile` times `TIMED_STEPS` steps of each stage. It leaves out the first `WARM_UP_STEPS` steps,
+in which the network is compiled, memory is allocated and the first views are rendered."""
 
 
 def profile(
@@ -200,7 +204,7 @@ def profile(
 
     Returns for each stage the crops per second, the same speed in images of 480x480 pixels per
     second, the fraction of the time spent waiting for data, and the peak memory so far (0 if
-    unknown).
+    unknown) of the process and of the GPU, in bytes.
     """
     from ..evaluation.profiling import peak_memory
     from .dataset import loading
@@ -223,7 +227,7 @@ def profile(
                         waited, started = 0.0, asked
                     batch = next(batches)
                     waited += time.perf_counter() - asked
-                    trainer.training_step(batch, step)  # reads the loss, so it waits for the GPU
+                    trainer.training_step(batch, step)  # reads the loss from the GPU, so it waits
                     bar.update(1)
             seconds = time.perf_counter() - started
             timed = first + length - timed_from

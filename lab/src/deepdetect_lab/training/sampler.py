@@ -16,15 +16,15 @@ from torch.utils.data import Sampler
 from .recipe import Stage, TrainingOptions
 
 FINAL_LEARNING_RATE = 1e-6
-"""Cosine annealing ends at this learning rate (paper, Section III-B)."""
+"""Cosine annealing of the learning rate ends at this value (paper, Section III-B)."""
 
 SHUFFLED_SHARDS = 4
-"""Number of shards that are read at a time and whose images are shuffled together. Chosen by hand;
-not measured."""
+"""Number of shards that are read at a time. Their images are shuffled together. Chosen by hand; not
+measured."""
 
 
 class CropIndex(NamedTuple):
-    """Index of a crop: number of the image, epoch, position in the epoch's order, and stage."""
+    """Index of a crop: number of the image, epoch, place in the epoch's random order, and stage."""
 
     image: int
     epoch: int
@@ -33,7 +33,11 @@ class CropIndex(NamedTuple):
 
 
 class Position(NamedTuple):
-    """Position of a step: its stage, its first crop in the stage, and the stage's first epoch."""
+    """Position of a step in its stage.
+
+    `sample` is the number of the step's first crop, counted from the start of the stage.
+    `first_epoch` is the number of the first epoch of the stage.
+    """
 
     stage: Stage
     sample: int
@@ -41,7 +45,7 @@ class Position(NamedTuple):
 
 
 class Schedule:
-    """The steps of a run with a recipe and a number of images."""
+    """The steps of a run: their stages, batches and learning rates, for a number of images."""
 
     def __init__(self, options: TrainingOptions, images: int) -> None:
         self.options = options
@@ -61,7 +65,7 @@ class Schedule:
         self._crops = np.concatenate([[0], np.cumsum(batches[self._stages])])
 
     def position(self, step: int) -> Position:
-        """Find the stage of a step and its position in the stage."""
+        """Find the stage of a step and the position of the step in its stage."""
         number = int(self._stages[step])
         stage = self.options.stages[number]
         first_epoch = sum(each.epochs for each in self.options.stages[:number])
@@ -80,7 +84,7 @@ class Schedule:
 
 
 def milestones(steps: int, count: int) -> set[int]:
-    """Return the numbers of steps at `count` evenly spaced points, including the end."""
+    """Return the steps after which to validate: `count` evenly spaced ones, including the last."""
     return {round(steps * part / count) for part in range(1, count + 1)} - {0}
 
 
@@ -89,10 +93,10 @@ class CropSampler(Sampler[list[CropIndex]]):
 
     Args:
         schedule: the steps.
-        shard_sizes: number of images in each shard, whose images are read together; None if
-            images can be read in any order.
-        first_step, last_step: the first step, and the step before which the batches end; by default
-            all steps.
+        shard_sizes: number of images in each shard, so that the crops of only a few shards are
+            mixed at a time. None: the images are not in shards, and are all mixed.
+        first_step, last_step: the batches go from the first step to the step before the last; by
+            default over all steps.
 
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
@@ -130,13 +134,14 @@ class CropSampler(Sampler[list[CropIndex]]):
         return batch
 
 
-@functools.lru_cache(maxsize=16)  # each of the interleaved stages has its own epoch
+@functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs
 def epoch_order(
     seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
 ) -> np.ndarray:
     """Return the numbers of the images in the random order of an epoch.
 
-    With shards, the images of a few shards at a time are shuffled.
+    With shards, the order of the shards is random, and the images of `SHUFFLED_SHARDS` successive
+    shards are shuffled together.
     """
     if shard_sizes is None:
         return np.random.default_rng([seed, 1, epoch]).permutation(count)

@@ -1,9 +1,9 @@
 """Synthetic scenes: layers of photographs in two views, with known correspondences.
 
-Both views are warped (zoom, rotation, tilt, perspective), the second also by a smooth relief. Parts
-of other photographs may be in front, each with a small motion of its own. So networks learn depth
-and occlusion without pairs of real photographs. The learned descriptor and the match filter are
-trained on these scenes.
+Both views are warped (zoom, rotation, tilt, perspective), the second one often also by a smooth
+relief. Parts of photographs may lie in front, each with a small motion of its own. So networks
+learn to cope with parallax and occlusion without pairs of real photographs. The learned descriptor
+and the match filter are trained on these scenes.
 """
 
 from __future__ import annotations
@@ -34,106 +34,111 @@ from .synthetic import (
 Drawn = TypeVar("Drawn")
 
 SIDE_PX = 256
-"""Default side of the square views in pixels, to which `PERSPECTIVE` refers. Chosen by hand."""
+"""Default side of the square views, for which `PERSPECTIVE` is given. Chosen by hand."""
 
 MARGIN_PX = 6
 """Keypoints within this distance of a view's border are not used, because part of their
 surroundings is cut off."""
 
 OFFSET_PX = 90.0
-"""The first view is centred up to 90 pixels from the photograph's centre along each axis. So every
-part of a photograph of 480 pixels is seen by some views."""
+"""The centre of the first view is up to 90 pixels from the photograph's centre along each axis. So
+every part of a photograph with sides of 480 pixels is seen by some views."""
 
 SCALE = Effect(1, math.log(0.6), math.log(1.5))
-"""Logarithm of the first view's scale, in pixels of the photograph per pixel of the view. Chosen by
-hand."""
+"""Range of the logarithm of the first view's scale, in pixels of the photograph per pixel of the
+view. Chosen by hand."""
 
 SCALE_LIMITS = (0.42, 1.8)
-"""Scales of both views, in pixels of the photograph per pixel of the view, stay in this range if
-the zoom allows. Below it views would be blurred, above it they would mostly show the mirrored
-borders of the photograph."""
+"""The scales of both views, in pixels of the photograph per pixel of the view, are brought into
+this range if the zoom between the views allows. Views with a smaller scale would be blurred. Views
+with a larger scale would mostly show the mirrored borders of the photograph."""
 
 ZOOMS = (Effect(1, -0.2, 0.2), Effect(0.5, -math.log(2.1), math.log(2.1)))
 FAR_ZOOM = Effect(0.18, math.log(1.8), math.log(4.2))
-"""Logarithm of the zoom from the first to the second view. If several of these effects are drawn,
-the last one counts. The far zoom enlarges or reduces. An earlier descriptor, trained on less zoom,
-was worse on zoomed images."""
+"""Ranges of the logarithm of the zoom from the first to the second view. If several of these
+effects happen, the last one counts. `FAR_ZOOM` enlarges or reduces, with equal probability. It is
+used because a descriptor that was trained on less zoom was worse on zoomed images."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
-"""The first share of the first views is rotated by any angle, and so is the second share of the
-second views relative to the first. All other rotations are normally distributed with these standard
-deviations in radians (about 8 degrees, like hand-held cameras)."""
+"""The first numbers are for the rotation of the first view, the second numbers for the rotation
+from the first to the second view. `ROTATED_SHARES` are the shares of rotations by any angle. All
+other angles are normally distributed with the standard deviations `UPRIGHT_DEVIATIONS`, in radians
+(about 8 degrees, like hand-held cameras)."""
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
-"""A tilt is the ratio of the scales along two axes. In the first share of the second views, its
-logarithm is normal with the second number as standard deviation. In all other second views, the
-logarithm is uniform up to a tilt of 2.5. This is a plane seen at 66 degrees. Beyond it, little of
-the plane can be described."""
+"""The tilt of a view is the ratio of its scales along two axes. In the share `NORMAL_TILT` of the
+second views, its logarithm is normally distributed with the standard deviation `TILT_DEVIATION`. In
+all other second views, the logarithm is uniform up to the tilt `LARGEST_TILT`, at which a plane is
+seen at 66 degrees. Beyond it, little of the plane can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
-"""Tilts of first views exceed 1 by at most these values. The first is for the scene, the second for
-parts in front."""
+"""The tilt in a first view exceeds 1, no tilt, by at most these values. `FIRST_TILT` is for the
+scene, `FRONT_TILT` for the parts in front."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
-"""The first is the standard deviation of both perspective coefficients, per pixel of a view of
-`SIDE_PX`. It changes the scale by 11 % from the middle to a border. For first views, it is
-multiplied by the second."""
+"""`PERSPECTIVE` is the standard deviation of both perspective coefficients of a homography, per
+pixel of a view with `SIDE_PX` pixels a side. A coefficient of this size changes the scale by 11 %
+from the middle to a border. In first views, the coefficients are multiplied by
+`FIRST_PERSPECTIVE`."""
 
 SHIFT_DEVIATION = 18.0
-"""Standard deviation of the second view's shift, in pixels of the first. Chosen by hand."""
+"""Standard deviation of the second view's shift, in pixels of the first view. Chosen by hand."""
 
 RELIEF_SHARE, RELIEF_PX = 0.45, (1.5, 5.0)
-"""The first is the share of second views with a relief. The second is the range of the relief's
-standard deviation in pixels."""
+"""`RELIEF_SHARE` is the share of the second views that have a relief. The standard deviation of its
+displacements, in pixels, is drawn from the range `RELIEF_PX`."""
 
 SMOOTH_CELLS = (3, 8)
-"""Reliefs and the outlines of parts in front have 3 to 7 random values along a side. With more, a
-relief could not be inverted, and parts would be smaller than the area that describes a keypoint."""
+"""Reliefs and the outlines of parts in front are interpolated from 3 to 7 random values along a
+side. With more values, a relief could not be inverted, and parts in front would be smaller than the
+area that describes a keypoint."""
 
 FRONT_SHARE, FRONT_COUNTS, OTHER_PHOTOGRAPH_SHARE = 0.5, (1, 1, 2, 3), 0.8
-"""The first is the share of the pairs with parts in front. Their number is drawn evenly from the
-second. The third is the share of the parts that are cut from another photograph."""
+"""`FRONT_SHARE` is the share of the scenes with parts in front. The number of these parts is drawn
+from `FRONT_COUNTS`. The share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs."""
 
 SHAPE_PX, UNCOVERED = 480, (0.6, 0.88)
-"""A part in front covers its photograph where smooth noise, 480 pixels a side, is above a quantile
-drawn from this range. So parts are blobs of any shape, over 12 to 40 % of their photograph."""
+"""A part in front is cut from a photograph where smooth noise, drawn with `SHAPE_PX` pixels a side,
+is above a quantile. The quantile is drawn from `UNCOVERED`. So parts are blobs of any shape that
+hold 12 to 40 % of their photograph."""
 
 FRONT_OFFSET_PX, FRONT_SCALE, FRONT_ANGLE = 60.0, 0.2, 0.3
-"""The pose of a part in front relative to the scene, in the first view. The first is the largest
-offset along each axis, in pixels of the photograph. The second and third are the standard
-deviations of the logarithm of the scale and of the angle in radians."""
+"""These numbers say how far the pose of a part in front may be from that of the scene, in the first
+view. `FRONT_OFFSET_PX` is the largest offset along each axis, in pixels of the photograph. The
+others are standard deviations: of the logarithm of the scale, and of the angle in radians."""
 
 MOTION_SHIFT, MOTION_SCALE, MOTION_ANGLE, MOTION_TILT = 22.0, 0.12, 0.06, 0.15
-"""The motion of a part in front relative to the scene, as standard deviations: of the shift in
-pixels of the view, the logarithm of the scale, the angle in radians, and the logarithm of the
-tilt."""
+"""These are standard deviations of the motion of a part in front relative to the scene, from the
+first to the second view. `MOTION_SHIFT` is in pixels of the first view, `MOTION_ANGLE` in radians.
+`MOTION_SCALE` and `MOTION_TILT` are for the logarithms of the scale and of the tilt."""
 
 ALIASED_SCALE, PIXEL_SIGMA = 1.15, 0.5
-"""A photograph that is reduced by more than the first factor is blurred before sampling, against
-aliasing. The blur takes pixels with a Gaussian footprint (sigma: the second number, in pixels) from
-the size of the photograph's pixels to the size of the view's."""
+"""A photograph that is reduced by a factor above `ALIASED_SCALE` is blurred before it is sampled,
+against aliasing. A pixel is treated as a Gaussian with a sigma of `PIXEL_SIGMA` pixels. The blur
+widens the Gaussian of a pixel of the photograph to that of a pixel of the view."""
 
 COVERED = 0.5
 """A part in front counts as visible in a pixel if it covers more than this share of the pixel."""
 
 STEP_PX = 2.0
-"""Derivatives are central differences over this step in pixels. Much smaller steps would suffer
-from rounding."""
+"""Derivatives of the map between the views are central differences over this step to either side,
+in pixels. Much smaller steps would suffer from rounding."""
 
 ATTEMPTS = 200
-"""Scenes are redrawn up to this number of times, until the views share enough keypoints. If they
+"""A scene is drawn up to this number of times, until its views share enough keypoints. If they
 never do, the photographs have too little detail."""
 
 ITERATIONS = 5
 """Number of fixed-point iterations to invert a relief. After five, the error is below 0.01 pixels
-at 99 % of all places, and at most 0.5 pixels."""
+at 99 % of the positions, and at most 0.5 pixels elsewhere."""
 
 
 @dataclass(frozen=True)
 class View:
-    """The map from a view to a photograph: a homography after a displacement by a relief, if any.
+    """The map from a view to a photograph: a displacement by the relief, then a homography.
 
-    The relief holds a displacement in pixels, (S, S, 2), for each pixel of the view.
+    The relief holds a displacement in pixels, (S, S, 2), for each pixel of the view. None: there is
+    no displacement.
     """
 
     matrix: np.ndarray
@@ -141,12 +146,12 @@ class View:
     side_px: int = SIDE_PX
 
     def to_photograph(self, xy: np.ndarray) -> np.ndarray:
-        """Map (N, 2) or (H, W, 2) positions of the view to the photograph."""
+        """Map positions in the view, (N, 2) or (H, W, 2), to positions in the photograph."""
         mapped = transform_points(xy + self._moved(xy), self.matrix)
         return mapped.astype(np.float32).reshape(xy.shape)
 
     def from_photograph(self, xy: np.ndarray) -> np.ndarray:
-        """Map (N, 2) positions of the photograph to the view, iteratively if there is a relief."""
+        """Map (N, 2) positions in the photograph to the view, iteratively if there is a relief."""
         flat = result = transform_points(xy, np.linalg.inv(self.matrix)).astype(np.float32)
         for _ in range(ITERATIONS if self.relief is not None else 0):
             result = flat - self._moved(result)
@@ -166,7 +171,10 @@ class View:
 
 
 class Layer(NamedTuple):
-    """An RGB photograph with its two views, and its shape: an opacity mask, (H, W) in [0, 1]."""
+    """A layer of a scene: an RGB photograph, its map for each of the two views, and its shape.
+
+    The shape is an opacity mask, (H, W) in [0, 1]. None: the layer covers the whole view.
+    """
 
     photograph: np.ndarray
     views: tuple[View, View]
@@ -175,7 +183,12 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose of a view: its centre in the photograph, scale, angle in radians, and tilt."""
+    """Pose of a view relative to a photograph.
+
+    `middle` is the point of the photograph in the centre of the view. `scale` is in pixels of the
+    photograph per pixel of the view, and `angle` in radians. `tilt` is the ratio of the scales
+    along two axes.
+    """
 
     middle: np.ndarray
     scale: float
@@ -198,9 +211,9 @@ class Pose:
 def draw_layers(
     rng: np.random.Generator, files: Sequence[Path], side_px: int = SIDE_PX
 ) -> tuple[list[Layer], list[float], float]:
-    """Draw a scene: its layers from back to front, the scale of each view, and the angle between.
+    """Draw a scene: its layers from back to front, the scales of the two views, and their rotation.
 
-    The angle is the absolute rotation between the two views, in radians.
+    The rotation is the absolute angle between the two views, in radians.
     """
     photograph = _draw_photograph(rng, files)
     middle = np.array(photograph.shape[1::-1]) / 2 + rng.uniform(-OFFSET_PX, OFFSET_PX, 2)
@@ -226,11 +239,11 @@ def draw_layers(
 
 
 def draw_until_seen(draw: Callable[[], Drawn | None]) -> Drawn:
-    """Call `draw` until it succeeds; raise an OptionError if the photographs show too little."""
+    """Call `draw` until it does not return None; raise an OptionError after `ATTEMPTS` calls."""
     for _ in range(ATTEMPTS):
         if (drawn := draw()) is not None:
             return drawn
-    raise OptionError("the images show too little for pairs of views: use photographs with detail")
+    raise OptionError("the images have too little detail for pairs of views: use other photographs")
 
 
 def _draw_photograph(rng: np.random.Generator, files: Sequence[Path]) -> np.ndarray:
@@ -252,7 +265,7 @@ def _draw_scales(rng: np.random.Generator) -> list[float]:
 
 
 def _draw_relief(rng: np.random.Generator, side_px: int) -> np.ndarray:
-    """Draw the displacement (S, S, 2) of each pixel of a view, all along one direction."""
+    """Draw a relief: the displacement (S, S, 2) of each pixel of a view, all in one direction."""
     azimuth = rng.uniform(0, 2 * math.pi)
     height = smooth_noise(rng, side_px, SMOOTH_CELLS) * rng.uniform(*RELIEF_PX)
     moved = np.stack([height * math.cos(azimuth), height * math.sin(azimuth)], -1)
@@ -262,7 +275,7 @@ def _draw_relief(rng: np.random.Generator, side_px: int) -> np.ndarray:
 def _draw_front(
     rng: np.random.Generator, files: Sequence[Path], scene: Layer, poses: tuple[Pose, Pose]
 ) -> Layer:
-    """Draw a part in front of a scene. It moves with the scene, plus a small motion of its own."""
+    """Draw a part in front of a scene, which moves with the scene and a little on its own."""
     first, second = poses
     side_px = scene.views[0].side_px
     other = happens(rng, OTHER_PHOTOGRAPH_SHARE)
@@ -291,7 +304,8 @@ def render_layers(
 ) -> tuple[np.ndarray, ...]:
     """Render one of the two views; return (S, S) float32 and the number of each pixel's top layer.
 
-    The view shows the luma, or the mixture of colour channels with the weights (1, 3).
+    `side` is 0 for the first view, 1 for the second. The view shows the luma, or the colour
+    channels mixed with the weights `mixture` (1, 3).
     """
     size = (layers[0].views[side].side_px,) * 2
     view, top = np.zeros(size, np.float32), np.zeros(size, np.uint8)
@@ -314,7 +328,7 @@ def render_layers(
 def mix_colours(photograph: np.ndarray, mixture: np.ndarray) -> np.ndarray:
     """Mix the colour channels of (H, W, 3) uint8 with weights (1, 3); return (H, W) uint8.
 
-    Negative weights are compensated by an offset, so that values do not fall below 0.
+    If weights are negative, an offset is added, so that values do not fall below 0.
     """
     mixed = cv2.transform(photograph.astype(np.float32), mixture)
     lifted: np.ndarray = np.clip(mixed - 255 * np.minimum(mixture, 0).sum(), 0, 255)
@@ -324,11 +338,11 @@ def mix_colours(photograph: np.ndarray, mixture: np.ndarray) -> np.ndarray:
 def correspond(
     layers: Sequence[Layer], tops: Sequence[np.ndarray], xy: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Map positions (N, 2) float32 of the first view to the second view.
+    """Map positions (N, 2) float32 in the first view to the second view.
 
-    `tops` holds the number of the top layer in each pixel of both views. Returns the positions
-    (N, 2) in the second view, the Jacobians (N, 2, 2) of the map, and whether each position is
-    visible in the second view (N,).
+    `tops` holds, for each of the two views, the number of the top layer in each pixel. Returns the
+    positions (N, 2) in the second view, the Jacobians (N, 2, 2) of the map, and a mask (N,) of the
+    positions that are visible in the second view.
     """
     there, jacobians = np.zeros_like(xy), np.zeros((len(xy), 2, 2))
     layer_of, visible = _at(tops[0], xy), np.zeros(len(xy), bool)

@@ -50,9 +50,9 @@ Files = tuple[tuple[Path, int], ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """A folder of shards: each file with its number of images.
+    """A folder of shards: the path of each shard, with its number of images.
 
-    The file names hold a digest of the content.
+    The name of a shard holds a digest of its content.
     """
 
     folder: Path
@@ -61,10 +61,10 @@ class Shards:
 
     @staticmethod
     def open(folder: Path, options: TrainingOptions) -> Shards | None:
-        """Read the index of a folder of shards for a recipe; None if it has no index.
+        """Read the index of a folder of shards; return None if there is no index.
 
         Raises:
-            OptionError: the shards were made with other options.
+            OptionError: the shards were made with options other than the given ones.
             ImageError: the index is damaged, or a shard is missing.
         """
         if not (folder / INDEX).is_file():
@@ -90,7 +90,7 @@ class ShardSource:
         return self.ends[-1] if self.ends else 0
 
     def __getitem__(self, index: int) -> SourceImage:
-        """Return an image. Its path is relative to the original folder."""
+        """Return an image. Its path is relative to the folder from which the shards were made."""
         shard, key, sample = self._sample(index)
         name = _read(shard, sample["name.txt"]).decode()
         return SourceImage(Path(name), key.rpartition("_")[2], *views_of(name, self.options))
@@ -105,11 +105,11 @@ class ShardSource:
         except (ImageError, KeyError, ValueError) as error:
             raise _damaged(shard, f"{self[index].path}: {error}") from None
         if mask.shape != image.shape[:2]:
-            raise _damaged(shard, f"the label of {self[index].path} has another size")
+            raise _damaged(shard, f"the label of {self[index].path} has the wrong size")
         return image, mask
 
     def _sample(self, index: int) -> tuple[Path, str, Mapping[str, tuple[int, int]]]:
-        """Return the shard of an image, the image's key, and offset and size of its files."""
+        """Return the shard of an image, the image's key, and its files as in `_read_members`."""
         number = bisect.bisect_right(self.ends, index)
         path, count = self.files[number]
         samples = _read_members(path)
@@ -131,20 +131,21 @@ def write_shards(
 ) -> Shards:
     """Write images with their labels into shards, in parallel over processes.
 
-    Existing shards with the same content are kept, so an interrupted call resumes, and only shards
-    of changed images are written again.
+    Existing shards with the same content are kept. So an interrupted call can be resumed, and when
+    images have changed, only their shards are written again.
 
     Args:
         images: folder of images.
-        output: folder for the shards, not that of the images.
-        options: the recipe of later runs, which determines the validation images.
+        output: folder for the shards, other than the folder of the images.
+        options: the recipe for training on the shards. It determines the validation images, and the
+            views and labels of all images.
         shard_size: approximate number of images per shard.
         workers: number of processes; default one per processor.
         quiet: show no progress bar.
 
     Raises:
-        ImageError: the folder is missing, or has too few images.
-        OptionError: the folder has shards that were made with other options.
+        ImageError: the folder of images is missing, or has too few images.
+        OptionError: `output` has shards that were made with other options.
         BatchError: images cannot be read. Shards without these images are kept.
         DeepDetectError: a shard cannot be written.
 
@@ -187,25 +188,25 @@ def write_shards(
             failures += unread
     if failures:
         raise BatchError(
-            f"{len(failures)} of {len(listed)} images cannot be read, other shards are kept",
+            f"{len(failures)} of {len(listed)} images cannot be read (other shards are kept)",
             sorted(failures),
         )
     index: dict[str, Any] = {"options": _fixed_options(options)}
     for kind, shards in files.items():
         index[kind] = [{"file": path.name, "images": count} for path, count in shards]
-    with atomic_path(output / INDEX) as temporary:  # written last, so shards are complete
+    with atomic_path(output / INDEX) as temporary:  # written last, when all shards are complete
         temporary.write_text(json.dumps(index, indent=1))
     return Shards(output, tuple(files["training"]), tuple(files["validation"]))
 
 
 ShardTask = tuple[Path, Sequence[tuple[str, SourceImage, Sequence[View]]]]
-"""A shard to write: its path, and for each image the name, the `SourceImage` and the views."""
+"""A shard to write: its path, and for each of its images the name, `SourceImage` and views."""
 
 
 def _deal(
     images: Sequence[SourceImage], root: Path, shard_size: int
 ) -> list[list[tuple[str, SourceImage]]]:
-    """Assign images to shards by checksums of their names, so that new images change few shards.
+    """Assign images to shards by hashes of their names, so that a new image changes few shards.
 
     Returns the (name, image) pairs of each shard.
     """
@@ -229,7 +230,7 @@ def _write_shard(task: ShardTask, labels: LabelOptions) -> tuple[int, list[str]]
                     failures.append(str(error))
                     continue
                 for ending, content in files.items():
-                    # No modification time, so the same images give the same file.
+                    # The modification time is not stored, so the same images give the same file.
                     member = tarfile.TarInfo(f"{k:06d}_{image.digest}.{ending}")
                     member.size = len(content)
                     tar.addfile(member, io.BytesIO(content))
@@ -251,7 +252,7 @@ def _files_of(
 
 @functools.lru_cache(maxsize=64)
 def _read_members(path: Path) -> list[tuple[str, dict[str, tuple[int, int]]]]:
-    """List the images of a shard: the key of each, and the offset and size of each of its files."""
+    """List the images of a shard: for each its key, and offset and size in bytes of its files."""
     samples: dict[str, dict[str, tuple[int, int]]] = {}
     try:
         with tarfile.open(path, "r:") as tar:
@@ -282,7 +283,7 @@ def _read_index(folder: Path, options: TrainingOptions) -> Shards:
         )
     except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise _damaged(folder / INDEX, error) from None
-    advice = "make the shards and train with the same, or write to another folder"
+    advice = "use the same settings for the shards and the training, or write to another folder"
     check_same(folder / INDEX, index.get("options"), _fixed_options(options), advice)
     return Shards(folder, training, validation)
 
@@ -292,7 +293,7 @@ def _damaged(path: Path, reason: object) -> ImageError:
 
 
 def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
-    """Return the options that must not change after the shards are written, as JSON values."""
+    """Return, as JSON values, the options that must not change after the shards are written."""
     names = ("short_sides", "square", "max_images", "val_fraction", "augmentations")
     fixed = {name: plain(getattr(options, name)) for name in names}
     return {**fixed, "labels": label_key(options.labels)}

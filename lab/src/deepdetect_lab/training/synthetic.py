@@ -1,7 +1,7 @@
-"""Synthetic views for all trainings: homographies, and changes of light, blur, noise and JPEG.
+"""Operations for synthetic views: homographies, and changes of light, blur, noise and JPEG.
 
-This module holds the operations. How often and how strongly a training applies them is its recipe:
-`Light` and `Camera`, which consist of `Effect`s.
+Each kind of training sets how often and how strongly these operations are applied, by a `Light` and
+a `Camera`, which consist of `Effect`s.
 """
 
 from __future__ import annotations
@@ -21,43 +21,43 @@ WHITE = 255
 """The highest grey level of an 8-bit image."""
 
 MIDDLE_GREY = 0.5
-"""Contrast is changed around this value of [0, 1], so that the mean brightness stays."""
+"""Contrast is changed around this value of [0, 1], so that the mean brightness hardly changes."""
 
 NOISE_CELLS = (2, 5)
-"""Smooth light is interpolated from 2 to 4 random values along a side. So it varies over a quarter
-to half of the view, like light in a room."""
+"""Smooth changes of light are interpolated from 2 to 4 random values along a side of the view. So
+bright and dark areas are a quarter to half as wide as the view, like light in a room."""
 
 LIT_RANGE = (0.15, 1.6)
-"""Smooth light multiplies values by factors in this range. Darker areas would show nothing, and
-brighter ones would be white."""
+"""Smooth changes of light multiply the values of a view by factors in this range. Darker areas
+would show nothing, and brighter ones would be white."""
 
 SHADOW_REACH_PX = 80.0
-"""The edge of a shadow passes the middle of the view within 80 pixels, so that both sides are
-seen."""
+"""The edge of a shadow passes the middle of the view at a distance of up to 80 pixels, so that the
+view shows both sides of the edge."""
 
 SHADOW_EDGE_PX = (0.7, 8.0)
-"""The edge of a shadow is blurred by a Gaussian with a sigma from 0.7 pixels (sunlight, object
-close to the surface) to 8 (light from a window)."""
+"""The edge of a shadow is blurred by a Gaussian. Its sigma ranges from 0.7 pixels (sunlight, and an
+object close to the surface) to 8 pixels (light from a window)."""
 
 CURVE_TONES = 6
-"""A curve of tones rises through 6 random values between black and white."""
+"""A tone curve rises from black to white through 6 random grey levels."""
 
 DARK_NOISE_LEVELS, DARK_NOISE_LIGHT = (0.2, 0.6, 3.0), 0.25
-"""The first three are standard deviations of the noise of dark views, in grey levels. The smallest
-is 0.2. The largest grows from 0.6 without light to 3.0 at 1/4 of the light (the second number),
-because shot noise grows with the number of photons."""
+"""The standard deviation of the noise in dark views, in grey levels, is drawn from a range that
+begins at 0.2. Its end grows from 0.6 without light to 3.0 at the fraction `DARK_NOISE_LIGHT` of the
+light, because shot noise grows with the number of photons."""
 
 
 def happens(rng: np.random.Generator, share: float) -> bool:
-    """Draw whether an effect with this share happens; nothing is drawn if it is 0 or 1."""
+    """Draw whether an effect happens, with probability `share`; 0 and 1 use no random number."""
     return share >= 1 or (share > 0 and rng.random() < share)
 
 
 class Effect(NamedTuple):
     """An effect on views: the share of the views that get it, and the range of its strength.
 
-    The strength is drawn uniformly if `power` is 1. A power above 1 makes low strengths more
-    frequent, a power below 1 high ones.
+    The strength is drawn uniformly if `power` is 1. A power above 1 makes strengths near `low` more
+    frequent, a power below 1 strengths near `high`.
     """
 
     share: float
@@ -83,18 +83,19 @@ NEVER = Effect(0, 0, 0)
 
 @dataclass(frozen=True)
 class Light:
-    """How `relight` changes values in [0, 1].
+    """How `relight` changes the light of a view, which has values in [0, 1].
 
     Attributes:
         share: share of the views that are changed at all.
-        field: smooth light. The strength is the fraction by which it varies.
+        field: smooth changes of light. The strength is the largest change, as a fraction.
         shadow: a shadow with an edge. The strength is the fraction of the light that it removes.
-        log_gamma: natural logarithm of the exponent of a gamma curve.
-        curve: share of the views with a random increasing tone curve.
-        contrast: factor of the contrast around the middle grey.
-        log_gain: natural logarithm of the factor of all values.
-        ramp: light that increases linearly by this fraction from border to border.
-        shift: range of the offset that is added together with a contrast or a gain.
+        log_gamma: a gamma curve. The strength is the natural logarithm of its exponent.
+        curve: share of the views that get a random increasing tone curve.
+        contrast: a change of contrast around `MIDDLE_GREY`. The strength is its factor.
+        log_gain: a factor on all values. The strength is its natural logarithm.
+        ramp: a linear increase of light across the view. The strength is the fraction by which it
+            differs between opposite borders.
+        shift: range of an offset. It is added only if the contrast or the gain is changed.
     """
 
     share: float = 1
@@ -114,11 +115,12 @@ class Camera:
 
     Attributes:
         blur: Gaussian blur. The strength is its sigma in pixels.
-        motion: motion blur of views without a Gaussian blur. The strength is a length in whole
+        motion: motion blur of views that get no Gaussian blur. The strength is its length, in whole
             pixels.
-        log_dark: natural logarithm of the fraction of the light that is left. It adds noise.
-        noise: noise of views that are not dark. The strength is the sigma in grey levels. The first
-            effect that happens is used.
+        log_dark: darkening, with the noise of dark views. The strength is the natural logarithm of
+            the fraction of the light that is left.
+        noise: noise of views that are not darkened. The strength is its sigma in grey levels. Only
+            the first of these effects that happens is applied.
         jpeg: JPEG compression. The strength is the quality, a whole number.
     """
 
@@ -130,9 +132,9 @@ class Camera:
 
 
 def relight(rng: np.random.Generator, view: np.ndarray, light: Light) -> np.ndarray:
-    """Change the light of a view, (S, S) in [0, 1].
+    """Change the light of a view, (S, S) with values in [0, 1].
 
-    Without `field`, `shadow` and `ramp` values can have any shape.
+    If `light` has no `field`, `shadow` and `ramp`, the view can have any shape.
     """
     if not happens(rng, light.share):
         return view
@@ -162,7 +164,7 @@ def relight(rng: np.random.Generator, view: np.ndarray, light: Light) -> np.ndar
 
 
 def blur(rng: np.random.Generator, view: np.ndarray, camera: Camera) -> np.ndarray:
-    """Blur a view of any type by defocus or motion, if the recipe's effects happen."""
+    """Blur a view by defocus or by motion, if one of these effects of the camera happens."""
     if camera.blur.happens(rng):
         return cv2.GaussianBlur(view, (0, 0), camera.blur.strength(rng))
     if camera.motion.happens(rng):
@@ -172,7 +174,7 @@ def blur(rng: np.random.Generator, view: np.ndarray, camera: Camera) -> np.ndarr
 
 
 def record(rng: np.random.Generator, levels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Simulate a camera: darken a float view in grey levels, add noise, compress; return uint8."""
+    """Darken a float view in grey levels, add noise, compress it; return uint8."""
     if camera.log_dark.happens(rng):
         light = math.exp(camera.log_dark.strength(rng))
         least, *most = DARK_NOISE_LEVELS
@@ -196,7 +198,7 @@ def compress(image: np.ndarray, quality: int) -> np.ndarray:
     kind = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if image.ndim == 2:
         return cv2.imdecode(cv2.imencode(".jpg", image, kind)[1], cv2.IMREAD_GRAYSCALE)
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)  # OpenCV's order, for the luma of JPEG
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)  # OpenCV expects BGR to compute the luma
     stored = cv2.imencode(".jpg", bgr, kind)[1]
     return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
@@ -218,18 +220,21 @@ def view_homography(
 
 
 def rotation(angle: float) -> np.ndarray:
-    """Return the rotation matrix (2, 2) for an angle in radians, from x towards y."""
+    """Return the rotation matrix (2, 2) for an angle in radians, from the x to the y axis."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s], [s, c]])
 
 
 def scaled_along(azimuth: float, along: float, across: float) -> np.ndarray:
-    """Return the matrix (2, 2) that scales along a direction, in radians, and across it."""
+    """Return the matrix (2, 2) that scales by `along` in a direction, by `across` perpendicularly.
+
+    The direction `azimuth` is in radians.
+    """
     return rotation(azimuth) @ np.diag([along, across]) @ rotation(-azimuth)
 
 
 def smooth_noise(rng: np.random.Generator, side_px: int, cells: tuple[int, int]) -> np.ndarray:
-    """Draw smooth noise, (S, S) float32: a coarse grid of normal values, interpolated.
+    """Draw smooth noise, (S, S) float32: normally distributed values on a grid, interpolated.
 
     The number of values along a side is drawn from the range `cells`, which excludes its end.
     """

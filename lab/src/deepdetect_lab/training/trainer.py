@@ -41,9 +41,9 @@ CHECKPOINT_INTERVAL_S = 60.0
 
 @dataclass
 class TrainingState:
-    """Progress of a run: steps done, and points of the training curves.
+    """Progress of a run: the number of steps done, and the points of the training curves.
 
-    The sum and the number of batch losses are those since the last point.
+    `loss_sum` and `loss_count` are the sum and the number of batch losses since the last point.
     """
 
     step: int = 0
@@ -57,12 +57,12 @@ class TrainingResult:
     """The results of a run.
 
     Attributes:
-        weights: file of the weights that are best in the validation, safetensors or npz.
+        weights: safetensors or npz file of the weights that are best in the validation.
         onnx: ONNX file with the same weights; None for a ranker.
         points: points of the training curves: losses and measures by name, for each validation.
         best: the point of the best weights.
-        images_per_second: mean speed, counted in images of 480x480 pixels; 0 for a training on
-            pairs.
+        images_per_second: mean speed of the training, counted in images of 480x480 pixels; 0 if it
+            is on pairs of views.
     """
 
     weights: Path
@@ -81,9 +81,9 @@ class Trainer(abc.ABC):
         average_decay: decay of the average per step. With 0 the average equals the network.
         optimizers: the optimisers of the network's parameters.
         options: the recipe.
-        origin: digests of the images and the initial weights. A run is only resumed if recipe and
-            origin are the same.
-        notes: further notes for the weights file.
+        origin: digests of the images and the initial weights. A run is resumed only with the same
+            recipe and origin.
+        notes: further notes to store in the weights file.
         purpose: what the network does, as a text for the model card.
         measures: what the validation measures, as a text for the model card.
         introduction: lines that are shown to the user before the first step.
@@ -114,10 +114,10 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return the loader of the batches of some steps."""
+        """Return a loader of the batches for steps `first` to `last` - 1; None: to the end."""
 
     def pixels(self, batch: Any) -> int:
-        """Return the number of pixels in a batch, from which the reported speed is computed."""
+        """Return the number of pixels in a batch, from which the speed is computed; 0: no speed."""
         return 0
 
     @abc.abstractmethod
@@ -133,7 +133,7 @@ class Trainer(abc.ABC):
         """Validate the weights after a number of steps; return the measures by name."""
 
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        """Write the averaged weights with notes."""
+        """Write the averaged weights to a file, with notes."""
         save_tensors(self.average.state_dict(), path, dict(notes))
 
     def read_notes(self, path: Path) -> Mapping[str, Any]:
@@ -141,11 +141,11 @@ class Trainer(abc.ABC):
         return read_notes(path)
 
     def export(self, folder: Path) -> Path | None:
-        """Write the best weights in another file format; return the file."""
+        """Write the best weights in another file format; return the file, None if there is none."""
         return None
 
     def training_step(self, batch: Any, step: int) -> float:
-        """Take the optimiser step with number `step`, from 0, on a batch; return the loss.
+        """Take one optimiser step on a batch; return the loss. Steps are numbered from 0.
 
         Raises:
             OptionError: the loss or its gradients are not finite.
@@ -158,7 +158,7 @@ class Trainer(abc.ABC):
         loss.backward()
         value = loss.item()
         norm = clip_grad_norm_(self.network.parameters(), self.max_gradient_norm)
-        # In bfloat16 a finite loss may have gradients that are not finite.
+        # In bfloat16, gradients may be infinite or NaN even if the loss is finite.
         if not (math.isfinite(value) and norm.isfinite()):
             raise OptionError(
                 f"the loss or its gradients are not finite at step {step}: start again with a "
@@ -189,7 +189,7 @@ class Trainer(abc.ABC):
                 log(line)
         measured = {point["step"] for point in state.points}
         if state.step in self.milestones and state.step not in measured:
-            self._validate(state, folder)  # at the start or after an interruption
+            self._validate(state, folder)  # at the start, or if it was interrupted here
         started, pixels = time.monotonic(), 0
         saved = started
         bar = progress(self.steps, "training", "step", log is None, state.step)
@@ -208,7 +208,7 @@ class Trainer(abc.ABC):
                     text += f", best {self._best(state)[self.objective]:.4f}"
                 bar.set_postfix_str(text, False)
                 if state.step in self.milestones:
-                    self._save(state, folder)  # validation also takes time
+                    self._save(state, folder)  # the validation may be interrupted
                     self._validate(state, folder)
                 if time.monotonic() - saved >= CHECKPOINT_INTERVAL_S:
                     self._save(state, folder)
@@ -223,7 +223,7 @@ class Trainer(abc.ABC):
         return min(state.points, key=lambda point: self.sign * point[self.objective])
 
     def _validate(self, state: TrainingState, folder: Path) -> None:
-        """Validate the weights, save them if they are the best so far, and save the state."""
+        """Validate the weights, save them if they are the best so far, and write a checkpoint."""
         loss = state.loss_sum / max(state.loss_count, 1)
         point = {"step": state.step, "training_loss": loss, **self.validate(state.step)}
         state.loss_sum, state.loss_count = 0.0, 0
@@ -243,13 +243,13 @@ class Trainer(abc.ABC):
         if not (folder / CHECKPOINT).exists():
             return TrainingState()
         tensors, metadata = read_checkpoint(folder / CHECKPOINT)
-        advice = "use the same to resume the run, or another `output`"
+        advice = "use the same settings to resume the run, or choose another `output`"
         check_same(folder, metadata.get("inputs"), self._inputs(), advice)
         names = [each.name for each in dataclasses.fields(TrainingState)]
         state = TrainingState(**{name: metadata[name] for name in names})
         restore(tensors, self.network, self.average, self.optimizers)
         if state.points:
-            self.read_notes(folder / self.weights_file)  # fails now instead of at the end
+            self.read_notes(folder / self.weights_file)  # if the file is missing, fail now
         return state
 
     def _inputs(self) -> dict[str, Any]:
@@ -274,7 +274,8 @@ class Trainer(abc.ABC):
             "",
             "## How good the weights are",
             "",
-            f"{self.measures}. This step was chosen by the {self.objective.replace('_', ' ')}.",
+            f"{self.measures}. The weights are those with the best "
+            f"{self.objective.replace('_', ' ')}.",
             "",
             Table("best", "", {"measure": "", "value": ".4f"}, best_rows).to_markdown(),
             "",
@@ -300,21 +301,22 @@ class Trainer(abc.ABC):
 
 
 def seeded(make: Callable[[], Network], seed: int) -> Network:
-    """Make a network with random weights by a seed, without changing the caller's random state."""
+    """Make a network with random weights from a seed, and keep the caller's random state."""
     with torch.random.fork_rng(devices=()):
         torch.default_generator.manual_seed(seed)
         return make()
 
 
 def digests(images: Sequence[Path], validation: Sequence[Path]) -> dict[str, str]:
-    """Return digests of training and validation images, as `origin` of a run."""
+    """Return digests of the training and the validation images, for `Trainer.origin`."""
     return {"images_digest": key(images)[:16], "validation_digest": key(validation)[:16]}
 
 
 def with_plateau(step: int, steps: int, warm_up: float, decay_share: float) -> float:
-    """Return the factor of the learning rate in a step.
+    """Return the factor by which the highest learning rate is multiplied in a step.
 
-    It rises to 1 over `warm_up` steps, and falls linearly to 0 over the last share of the steps.
+    It rises linearly to 1 over the first `warm_up` steps, stays there, and falls linearly to 0 over
+    the last share `decay_share` of the steps.
     """
     return min(1, (step + 1) / warm_up, (1 - step / steps) / decay_share)
 

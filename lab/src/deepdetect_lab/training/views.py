@@ -1,4 +1,4 @@
-"""Source images of a run, their views (of some size, light and augmentation), and their labels."""
+"""Source images of a run, their views (size, light, augmentation), and the labels of the views."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ from .recipe import TrainingOptions
 class View:
     """A view of an image for the network: shorter side in pixels, light and shape.
 
-    It shows the whole image, its central square, the image resized to a square, or an augmented
-    square part. `augmentation` is the seed of the augmented part.
+    `square` is None if it shows the whole image, "crop" for the central square, and "squash" for
+    the image resized to a square. If `augmentation` is given, the view instead shows a square part
+    with random augmentations, of which this is the seed.
     """
 
     short_side: int
@@ -36,7 +37,7 @@ class View:
 
     @property
     def name(self) -> str:
-        """Short name for files, unique among the views of an image."""
+        """Short name for use in file names, unique among the views of an image."""
         light = "normal"
         if self.darkening is not None:
             light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
@@ -48,7 +49,7 @@ class View:
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image for training or validation: file, digest of its content, and views."""
+    """An image for training or validation: its file, a digest of the content, and its views."""
 
     path: Path
     digest: str
@@ -57,14 +58,14 @@ class SourceImage:
 
     @property
     def validation_views(self) -> tuple[View, View]:
-        """The normal and the dark view for validation."""
+        """The view in normal light and the dark view that are used for validation."""
         return self.normal[0], self.dark[0]
 
 
 def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """List the normal and the dark views of an image, by size, with augmented views last.
+    """Return the normal and the dark views of an image: one of each size, then augmented ones.
 
-    The image's relative path is the seed of its dark and augmented views.
+    `name`, the image's relative path, is the seed of the random choices.
     """
     generator = np.random.default_rng(zlib.crc32(name.encode()))
     normal = tuple(View(side, None, options.square) for side in options.short_sides)
@@ -81,7 +82,7 @@ def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tup
 
 
 def render(image: object, view: View) -> np.ndarray:
-    """Make a view, (H, W, 3) uint8 RGB, of an image in any form that `load_image` accepts."""
+    """Render a view, (H, W, 3) uint8 RGB, of an image in any form that `load_image` accepts."""
     rgb = load_image(image)
     if view.augmentation is not None:
         rgb = augment(rgb, view.short_side, view.augmentation)
@@ -107,7 +108,7 @@ def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray
 
 
 def label_key(options: LabelOptions) -> str:
-    """Return a digest of the label settings, on which a label depends besides image and view."""
+    """Return a digest of the label settings. A label depends on these, the image and the view."""
     names = options.detectors
     return key({n: [options.parameters(n, "normal"), options.parameters(n, "low")] for n in names})
 
@@ -117,7 +118,7 @@ def list_images(
 ) -> list[SourceImage]:
     """List the images in a folder, recursively.
 
-    If there are more than `limit`, checksums of their names decide which are used.
+    If there are more than `limit`, checksums of their file names decide which ones are used.
     """
     paths = find_images(root, exclude)
     if limit is not None and len(paths) > limit:
@@ -136,12 +137,14 @@ def train_val_split(
 ) -> tuple[list[SourceImage], list[SourceImage]]:
     """Split images into training images and about the given fraction of validation images.
 
-    Checksums of names decide, so that an image stays in its part when other images are added.
+    A checksum of its file name decides for each image, so that the image stays in its part when
+    other images are added.
     """
     training: list[SourceImage] = []
     validation: list[SourceImage] = []
     for image in images:
-        # The reversed checksum is independent of the choice of `list_images`.
+        # `list_images` selects images by the same checksum. With reversed bits, the split is
+        # independent of that selection.
         draw = int(f"{zlib.crc32(image.path.name.encode()):032b}"[::-1], 2) / 2**32
         (validation if draw < val_fraction else training).append(image)
     if not validation:

@@ -17,12 +17,15 @@ from ...networks.export import to_onnx
 from .network import DescriptorNetwork
 
 MIN_HALVED = 1000
-"""Kernels with more values than this are stored as float16, which halves the file. Runtimes
-compute in float32."""
+"""Kernels with more values than this are stored as float16, which halves the file. The graph
+converts them to float32 before it computes with them."""
 
 
 def export_descriptor(network: DescriptorNetwork, path: Path, kind: str = LEARNED) -> None:
-    """Write a network as an ONNX file that `PointDetector.extract` reads (`DESCRIPTOR_GRAPHS`)."""
+    """Write a network as an ONNX file for `PointDetector(descriptor=...)`.
+
+    `DESCRIPTOR_GRAPHS` lists the inputs and outputs. `kind` is the type of the descriptors.
+    """
     luma = torch.zeros(1, 1, STRIDE, 2 * STRIDE)
     inputs = {"luma": luma, "xy": torch.ones(1, 50, 2), "sizes": torch.ones(1, 50)}
     axes = {name: {1: "keypoints"} for name in ("xy", "sizes", "descriptors")}

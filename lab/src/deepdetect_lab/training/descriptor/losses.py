@@ -1,4 +1,4 @@
-"""The contrastive loss of pairs of views, and the fraction of correct mutual matches as metric."""
+"""The contrastive loss of pairs of views, and the validation metric: correct mutual matches."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from .network import DescriptorNetwork, turn
 from .views import Pair
 
 NEAR_PX = 3.0
-"""Keypoints within this distance of the true position are not negatives in the loss. In the metric,
-they are correct."""
+"""Two keypoints that are closer than this in either view are not negatives of each other in the
+loss. A match is correct in the metric if it lies within this distance of the true position."""
 
 MAX_LOG_TEMPERATURE = 4.3
 UPRIGHT, ANGLE_NOISE = 0.45, 0.15
-"""Pairs rotated by less than the first angle, in radians, count as upright. The second is the
-standard deviation in radians of the simulated errors of keypoint angles. Both are chosen by hand
-and not measured."""
+"""Pairs of views that are rotated against each other by less than `UPRIGHT` radians count as
+upright. `ANGLE_NOISE` is the standard deviation, in radians, of the simulated errors of keypoint
+angles. Both are chosen by hand and not measured."""
 
 KINDS = ("upright", "turned", "zoomed")
 
 
 def kind_of(angle: float, zoom: float) -> str:
-    """Return the kind of a pair, one of `KINDS`, by the rotation and log zoom between its views."""
-    if zoom > 0.6:  # by 1.8
+    """Return one of `KINDS` for the absolute rotation (radians) and log zoom between two views."""
+    if zoom > 0.6:  # a zoom by a factor of 1.8
         return "zoomed"
     return "upright" if angle < UPRIGHT else "turned"
 
 
 def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
-    """Describe the keypoints of both views without rotation by their angles; (B, N, 64) each."""
+    """Describe the keypoints of both views, without undoing any rotation; (B, N, 64) each."""
     images = batch.images.transpose(0, 1).flatten(0, 1)[:, None].float() / 255
     with torch.autocast(images.device.type, torch.bfloat16):
         maps = network.maps(images.contiguous(memory_format=torch.channels_last))
@@ -44,7 +44,7 @@ def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Ten
 
 
 def mirror(batch: Pair, which: Tensor) -> Pair:
-    """Mirror the pairs that are marked in `which`, (B,) bool, left to right."""
+    """Mirror those pairs of a batch left to right that are marked in `which`, (B,) bool."""
 
     def mirrored(xy: Tensor) -> Tensor:
         x, y = xy.unbind(-1)
@@ -63,10 +63,11 @@ def contrastive_loss(
 ) -> Tensor:
     """Return the symmetric InfoNCE loss, the cross-entropy of the true match among all keypoints.
 
-    Half of the pairs are mirrored. The descriptors of the second view are rotated back by the
-    keypoints' relative angles, with the noise of a detector and multiplied by `counted` (see
-    `angles_counted`). Half of the pairs rotated by less than `UPRIGHT` are left as they are,
-    because descriptors of upright images are not rotated in use.
+    Half of the pairs are mirrored. The descriptors of the second view are rotated back by `counted`
+    (see `angles_counted`) times the rotation between the views at each keypoint. To imitate a
+    detector, this angle has random errors. If a pair is rotated by less than `UPRIGHT`, its
+    descriptors are not rotated back in half of the cases, because in use those of upright images
+    are not rotated either.
     """
     device, count = batch.turns.device, len(batch.turn)
     mirrored, kept = torch.from_numpy(generator.random((2, count)) < 0.5).to(device)
@@ -95,9 +96,9 @@ def _near(xy: Tensor) -> Tensor:
 def shares_right(
     network: DescriptorNetwork, batches: Iterable[Pair], counted: int = 1
 ) -> dict[str, float]:
-    """Return the share of keypoints that are correct mutual nearest neighbours, by kind of pair.
+    """Return the share of keypoints whose mutual nearest neighbour is correct, by kind of pair.
 
-    The network must be in evaluation mode, and there must be pairs of each of `KINDS`.
+    The network must be in evaluation mode, and `batches` must hold pairs of each of `KINDS`.
     """
     shares: dict[str, list[float]] = {kind: [] for kind in KINDS}
     generator = np.random.default_rng(1)

@@ -20,22 +20,22 @@ from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, 
 from deepdetect.features.learned import CONSTANT, FREQUENCIES
 
 HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
-"""The first five are the numbers of channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the image size. The
-last is the number of hidden units of the perceptron."""
+"""`HIDDEN` is the number of hidden units of the perceptron. The others are the numbers of channels
+of feature maps, from 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`)."""
 
 DIMENSIONS = CONSTANT + 2 * len(FREQUENCIES)
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
-"""Keypoints up to this size are described in the full image. Larger ones are described in the image
-reduced to 1/2 or 1/4, or between two octaves."""
+"""Keypoints up to this size are described by feature maps of the full image. Larger keypoints also
+need those of the image reduced to 1/2 or 1/4, which are interpolated between octaves."""
 
 SMALLEST_SIZE_PX = 2.5
 NOISE = 1 / 255
-"""Standard deviation of noise in local contrast, one grey level. Smaller variations are not
-amplified to full contrast."""
+"""Variations of the luma with about this standard deviation, one grey level, count as noise. So the
+normalisation by local contrast does not amplify them to full contrast."""
 
 CELL_PX, CELLS = 8, 5
-"""Local contrast is computed over squares of 5 cells of 8 pixels. Chosen by hand; not measured."""
+"""Local contrast is that of a square of 5x5 cells of 8x8 pixels. Chosen by hand; not measured."""
 
 BATCH_MOMENTUM = 0.1
 
@@ -43,8 +43,8 @@ BATCH_MOMENTUM = 0.1
 class Convolution(nn.Module):
     """A convolution with batch normalisation and ReLU.
 
-    In training, all octaves use the batch statistics of the first octave, since the trained network
-    has a single normalisation for all octaves.
+    In training, all octaves are normalised by the batch statistics of the first octave, because the
+    trained network has only one set of running statistics, for all octaves.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
@@ -72,7 +72,7 @@ class Convolution(nn.Module):
 
 
 class Halving(nn.Module):
-    """Two convolutions, of which the first halves width and height."""
+    """Two convolutions. The first halves the width and the height."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -116,7 +116,10 @@ class DescriptorNetwork(nn.Module):
         return self.describe(self.maps(luma), xy, sizes)
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
-        """Return the feature maps of each octave: at 1/2, 1/4, 1/8, 1/8 with context, and 1/16."""
+        """Return five feature maps of each octave, at 1/2, 1/4, 1/8, 1/8 and 1/16 of its size.
+
+        The last two maps also contain context from coarser maps.
+        """
         x, result = _normalized(luma), []
         for octave in range(OCTAVES):
             if octave:
@@ -159,7 +162,7 @@ class DescriptorNetwork(nn.Module):
 
 
 def _normalized(luma: Tensor) -> Tensor:
-    """Return (B, 2, H, W): the luma normalised by global contrast, and by local contrast."""
+    """Return (B, 2, H, W): the luma normalised by the image's contrast, and by local contrast."""
     mean = luma.mean((2, 3), keepdim=True)
     variance = (luma - mean).square().mean((2, 3), keepdim=True)
     whole = (luma - mean) / (variance + 1e-6).sqrt()
@@ -178,10 +181,10 @@ def _doubled(features: Tensor) -> Tensor:
 
 
 def _read(features: Tensor, xy: Tensor) -> Tensor:
-    """Sample (B, C, H, W) bilinearly at positions; return (B, N, C).
+    """Sample feature maps (B, C, H, W) bilinearly at positions (B, N, 2); return (B, N, C).
 
-    Positions outside are clamped to the border. This gathers all channels of a pixel at once, which
-    is twenty times as fast on a CPU as `grid_sample`, which reads each channel separately.
+    Positions outside a map are clamped to its border. All channels of a pixel are gathered at once.
+    On a CPU this is twenty times as fast as `grid_sample`, which reads each channel separately.
     """
     shape = torch._shape_as_tensor(features)
     last = shape[[3, 2]].to(xy.dtype) - 1
@@ -201,7 +204,7 @@ def _read(features: Tensor, xy: Tensor) -> Tensor:
 
 
 def turn(descriptors: Tensor, angles: Tensor) -> Tensor:
-    """Rotate descriptors (..., 64) by angles (...) in radians, like `turn_descriptors` in NumPy."""
+    """Rotate descriptors (..., 64) by angles (...) in radians, as `turn_descriptors` does."""
     turns = angles[..., None] * torch.from_numpy(FREQUENCIES).to(angles)
     constant, numbers = descriptors[..., :CONSTANT], descriptors[..., CONSTANT:]
     (real, imaginary), (c, s) = numbers.chunk(2, -1), (turns.cos(), turns.sin())

@@ -28,22 +28,22 @@ from .views import Pair, draw_pair
 ONNX = "descriptor.onnx"
 
 REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
-"""Each pair is used in 4 steps on average, because drawing pairs takes longer than a training step.
-Steps choose from the last 4,096 pairs. The first step chooses from 8 batches."""
+"""Each pair is used in `REUSE` steps on average, because drawing a pair takes longer than training
+on it. A step chooses from the last `WINDOW` pairs, the first step from `FIRST_BATCHES` batches."""
 
 WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
-"""The warm-up takes the first number of steps, but at most the second share of all steps. Both are
-chosen by hand and not measured."""
+"""The learning rate rises over `WARM_UP_STEPS` steps, but at most over the share `WARM_UP_SHARE` of
+all steps. Both are chosen by hand and not measured."""
 
 DECAY_SHARE = 0.65
 """The learning rate falls linearly to 0 over this last share of the steps. Chosen by hand."""
 
 VECTOR_RATE = 0.4
-"""AdamW trains the parameters that Muon cannot; its learning rate is Muon's times this factor."""
+"""AdamW trains the parameters that do not suit Muon, at Muon's learning rate times this factor."""
 
 
 def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
-    """Return the numbers of the pairs that a step trains on, drawn from a sliding window."""
+    """Return the numbers of the pairs for a step, drawn from a window of recent pairs."""
     last = (step + 1) * options.pairs // REUSE + FIRST_BATCHES * options.pairs
     generator = np.random.default_rng([options.seed, 4, step])
     return generator.integers(max(0, last - WINDOW), last, options.pairs)
@@ -52,7 +52,7 @@ def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
 def pairs_to_draw(
     options: DescriptorTrainingOptions, first: int, last: int
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yield each step with the numbers of its new pairs, which no step since `first` has used."""
+    """Yield each step with the numbers of its pairs that no step since `first` has used yet."""
     drawn: set[int] = set()
     for step in range(first, last):
         wanted = set(pairs_of_step(options, step).tolist())
@@ -61,18 +61,18 @@ def pairs_to_draw(
 
 
 def draw_numbered(files: Sequence[Path], cross_modal: bool, *seed: int) -> Pair:
-    """Draw a pair by a seed; raise an OptionError if the images show too little."""
+    """Draw the pair of a seed; raise an OptionError if the images have too little detail."""
     generator = np.random.default_rng(seed)
     return draw_until_seen(lambda: draw_pair(generator, files, cross_modal))
 
 
 def stack(pairs: Sequence[Pair]) -> Pair:
-    """Stack pairs of arrays into a batch of tensors."""
+    """Stack pairs that hold arrays into one batch that holds tensors."""
     return Pair(*(torch.from_numpy(np.stack(values)) for values in zip(*pairs, strict=True)))
 
 
 class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
-    """The new pairs of each step. A pair is a pure function of the seed and its number."""
+    """The pairs that each step is the first to use, determined by the seed and their numbers."""
 
     def __init__(self, files: Sequence[Path], options: DescriptorTrainingOptions) -> None:
         self.files, self.options = files, options
@@ -85,7 +85,7 @@ class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
 
 
 def validation_batches(files: Sequence[Path], options: DescriptorTrainingOptions) -> list[Pair]:
-    """Draw the fixed validation pairs, equally many of each of `KINDS`, in batches."""
+    """Draw the batches of validation pairs, which are fixed: `val_pairs` of each of `KINDS`."""
     pairs: dict[str, list[Pair]] = {kind: [] for kind in KINDS}
     number = 0
     while min(map(len, pairs.values())) < options.val_pairs:
@@ -98,13 +98,14 @@ def validation_batches(files: Sequence[Path], options: DescriptorTrainingOptions
 
 
 class DescriptorTrainer(Trainer):
-    """Training of the descriptor network on views of images."""
+    """Training of the descriptor network on pairs of synthetic views of images."""
 
     objective, sign = "score", -1
     purpose = "that describes keypoints"
     measures = (
-        "Share of the keypoints that are mutual nearest neighbours and correct to 3 px, on pairs "
-        "of views of the validation images; the score is their mean"
+        "Share of the keypoints whose match, a mutual nearest neighbour, is correct within 3 px, "
+        "for each kind of pairs of views of the validation images; the score is the mean of these "
+        "shares"
     )
     weights_file = "descriptor.safetensors"
     max_gradient_norm = 2.0
@@ -138,7 +139,8 @@ class DescriptorTrainer(Trainer):
         self.network = network.to(self.device).to(memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network).eval()
         self.network.train()
-        # Muon is for maps between many features, unlike the first layer and those of the size.
+        # Muon suits layers between many features. AdamW trains the other parameters: the first
+        # layer, the layers that take the keypoint's size, and vectors.
         kernels: list[Any] = []
         vectors: list[Any] = []
         for name, parameter in self.network.named_parameters():
@@ -151,7 +153,10 @@ class DescriptorTrainer(Trainer):
         self.milestones = milestones(options.steps, options.val_count)
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return the loader of some steps: a step, its new pairs' numbers, and the new pairs."""
+        """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
+
+        The pairs are those that no earlier step has used, or None if there are none.
+        """
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(
             PairDataset(self.files, self.options),
@@ -162,10 +167,10 @@ class DescriptorTrainer(Trainer):
         )
 
     def loss(self, batch: tuple[int, list[int], Pair | None]) -> Tensor:
-        """Return the loss of a step's pairs.
+        """Return the loss of the pairs that a step trains on.
 
-        The batch holds the step's new pairs. They replace older pairs in the window, which is on
-        the device and already holds the step's other pairs.
+        `batch` holds the number of the step and its new pairs. They replace the oldest pairs in
+        `window`, a buffer on the device, which already holds the other pairs of the step.
         """
         step, numbers, pairs = batch
         if pairs is not None:
@@ -181,12 +186,12 @@ class DescriptorTrainer(Trainer):
         return contrastive_loss(self.network, chosen, generator, angles_counted(self.kind))
 
     def learning_rate(self, step: int) -> float:
-        """Return the rate of Muon in a step: a warm-up, a plateau, a linear decay to 0."""
+        """Return Muon's learning rate in a step: a warm-up, a plateau, a linear decay to 0."""
         warm_up = min(WARM_UP_STEPS, WARM_UP_SHARE * self.steps)
         return self.options.learning_rate * with_plateau(step, self.steps, warm_up, DECAY_SHARE)
 
     def validate(self, step: int) -> dict[str, float]:
-        """Measure the average of the weights so far."""
+        """Measure the averaged weights on the validation pairs."""
         shares = shares_right(self.average, self.batches, angles_counted(self.kind))
         return {"score": sum(shares.values()) / len(shares), **shares}
 

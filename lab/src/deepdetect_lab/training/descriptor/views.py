@@ -1,7 +1,7 @@
 """Draw training pairs: two views of a synthetic scene, and the keypoints visible in both.
 
-Each view has its own light, blur, noise and JPEG compression. So the descriptor learns depth,
-occlusion and darkness without pairs of real photographs.
+Each view has its own light, blur, noise and JPEG compression. So the descriptor learns to cope with
+parallax, occlusion and darkness without pairs of real photographs.
 """
 
 from __future__ import annotations
@@ -32,44 +32,47 @@ from ..synthetic import (
 )
 
 KEYPOINTS = 256
-"""A pair has at most this many keypoints, because the loss compares all with all. They are enough
-to fill a view."""
+"""A pair has at most this many keypoints, because the loss compares each keypoint of one view with
+all of the other. They are enough to fill a view."""
 
 LEAST_KEYPOINTS, LEAST_IF_ZOOMED, ZOOMED = 64, 40, 0.8
-"""Pairs with fewer common keypoints than the first number are drawn again. If the logarithm of the
-zoom is above the third, the limit is the second."""
+"""Pairs whose views share fewer than `LEAST_KEYPOINTS` keypoints are drawn again. If the absolute
+logarithm of the zoom between the views is above `ZOOMED`, the limit is `LEAST_IF_ZOOMED`."""
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
-"""The first is the largest number of candidates in the first view. The second limits their sigma,
-because the surroundings of larger ones do not fit into a view of 256 pixels."""
+"""Only the `STRONGEST` best candidates of the first view are used. Their sigma is below
+`MAX_FIRST_SIGMA_PX`, because the areas around larger ones do not fit into a view of 256 pixels."""
 
 SIGMA_RANGE_PX = (1.0, 13.0)
-"""Range of the sigmas of keypoints in the second view. Smaller keypoints cannot be described, and
-the surroundings of larger ones do not fit into the view."""
+"""Keypoints are left out if their sigma in the second view is not in this range. Smaller keypoints
+cannot be described, and the areas that describe larger ones do not fit into the view."""
 
 MIN_GROWTH = 0.02
-"""Keypoints are left out if areas around them change by less than this factor from the first to the
-second view, because these surfaces are seen at a grazing angle."""
+"""Keypoints are left out if the area around them shrinks to less than this fraction from the first
+to the second view, because the second view sees their surface at a grazing angle."""
 
 CLEAN_SHARE, RANDOM_SHARE = 0.6, 0.7
-"""The first is the share of the pairs whose keypoints are detected before light and noise are
-changed, to simulate a repeatable detector. The second is the share with random keypoints instead of
-the strongest."""
+"""`CLEAN_SHARE` is the share of the pairs whose keypoints are detected before light and noise are
+changed, to simulate a repeatable detector. `RANDOM_SHARE` is the share of the pairs that keep
+random keypoints instead of the strongest."""
 
 JITTER_PX = 0.5
-"""Keypoints in the first view are moved by up to half a pixel along each axis, like positions that
-are rounded to pixels."""
+"""Keypoints in the first view are moved at random by up to half a pixel along each axis. This
+simulates positions that are rounded to whole pixels."""
 
 SIZE_ERRORS, SMALL_ERROR_SHARE = (0.12, 0.4), 0.6
-"""Keypoint sizes in the second view have errors, as those of detectors do. The first are two
-standard deviations of their logarithm. The second is the share with the smaller one."""
+"""Keypoint sizes in the second view get random errors, as those of detectors have. The standard
+deviation of the logarithm of the size is the first of `SIZE_ERRORS` for the share
+`SMALL_ERROR_SHARE` of the keypoints, and the second for the rest."""
 
 PLACE_ERROR_PX, PLACE_ERROR_PER_SIGMA, PLACE_ERROR_SIGMA = 0.225, 0.162, 6.0
-"""The standard deviation of a keypoint's position in the second view is the first number of pixels
-plus the second for each pixel of its sigma. Sigmas above the third count as the third."""
+"""Keypoint positions in the second view get random errors. Their standard deviation in pixels is
+`PLACE_ERROR_PX` plus `PLACE_ERROR_PER_SIGMA` times the keypoint's sigma. A sigma above
+`PLACE_ERROR_SIGMA` counts as `PLACE_ERROR_SIGMA`."""
 
 UNCHANGED_SHARE = 0.15
-"""Share of views without changes of light, blur or noise. Chosen by hand; not measured."""
+"""Share of the views that get no change of light, blur, noise or compression. Chosen by hand; not
+measured."""
 
 LIGHT = Light(
     field=Effect(0.25, 0, 0.7, power=0.5),
@@ -86,41 +89,47 @@ CAMERA = Camera(
     noise=(Effect(0.35, 1, 14),),
     jpeg=Effect(0.3, 8, 75),
 )
-"""The recipe of each view. It goes down to 1/50 of the light and to JPEG of quality 8, the lowest
-values that occur in use. What the single ranges contribute was not measured."""
+"""Random changes of each view. They go down to 1/50 of the light and to JPEG quality 8, the lowest
+values that occur in use. How much each of the ranges contributes was not measured."""
 
 CROSS_MODAL_SHARE, MIXED_SHARE = 0.6, 0.45
-"""Shares of the pairs for a descriptor of images of different sensors. In the first share, the
-tones of one view are changed. In the second, one view shows another mixture of the colours."""
+"""Pairs for the cross-modal descriptor imitate two sensors. The share `CROSS_MODAL_SHARE` of these
+pairs has changed tones in one view (`change_tones`). The share `MIXED_SHARE` has one view that
+shows a random mixture of the colour channels (`draw_mixture`). A pair may have both changes."""
 
 ONE_COLOUR_SHARE, MIXTURE_DEVIATION, LEAST_WEIGHT = 0.4, 0.6, 0.5
-"""The first is the share of mixtures that are a single colour channel. The weights of all other
-mixtures are normal with mean 1/3 and the second as standard deviation. They are divided by the sum
-of their absolute values, or by the third if that is larger."""
+"""A mixture is a single colour channel with the probability `ONE_COLOUR_SHARE`. Otherwise the three
+weights are drawn from a normal distribution with mean 1/3 and standard deviation
+`MIXTURE_DEVIATION`. They are divided by the sum of their absolute values, or by `LEAST_WEIGHT` if
+the sum is smaller."""
 
 TONES = {"negative": 0.35, "curve": 0.7, "curves": 0.88}
-"""Cumulative shares of the kinds of changed tones. The remaining share shows edges."""
+"""Cumulative shares of three ways to change the tones of a view: a negative, one tone curve, or a
+blend of two tone curves. The remaining views show edges."""
 
 CURVE_TONES = (3, 8)
-"""A tone curve has 3 to 7 random values. With more, it would turn the image into noise."""
+"""A tone curve is drawn through 3 to 7 random values. More would turn the image into noise."""
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = (0.7, 1.5), 0.98
-"""Edges are gradient magnitudes after a blur with a sigma in pixels from the first range. The
-second is the quantile of the magnitudes that becomes white."""
+"""A view of edges shows gradient magnitudes after a Gaussian blur, whose sigma in pixels is drawn
+from `EDGE_SIGMA_PX`. Magnitudes from the quantile `EDGE_QUANTILE` on become white."""
 
 DARK_EDGES_SHARE = 0.5
 
 
 class Pair(NamedTuple):
-    """Two views and their corresponding keypoints, as arrays, or as tensors of a batch (B, ...).
+    """Two views and their corresponding keypoints; 0 and 1 in names stand for the views.
+
+    The values are arrays. In a batch of pairs they are tensors with a first axis (B, ...).
 
     Attributes:
-        images: (2, S, S) uint8.
-        positions0, positions1: (N, 2) float32 pixels.
-        sizes0, sizes1: (N,) float32 pixels.
-        turns: (N,) float32 rotations in radians from the first view to the second.
+        images: both grey views, (2, S, S) uint8.
+        positions0, positions1: keypoint positions, (N, 2) float32, in pixels.
+        sizes0, sizes1: keypoint sizes, (N,) float32, in pixels.
+        turns: rotation from the first view to the second at each keypoint, (N,) float32 radians.
         valid: (N,) bool, false for rows that are padding.
-        turn, zoom: absolute rotation in radians and absolute log zoom between the whole views.
+        turn, zoom: absolute rotation in radians, and absolute logarithm of the zoom, between the
+            views as a whole.
     """
 
     images: Any
@@ -137,7 +146,10 @@ class Pair(NamedTuple):
 def draw_pair(
     rng: np.random.Generator, files: Sequence[Path], cross_modal: bool = False
 ) -> Pair | None:
-    """Draw a pair of views of one or two sensors; None if they share too few keypoints."""
+    """Draw a pair of views, or return None if they share too few keypoints.
+
+    With `cross_modal`, the views imitate images of two different sensors.
+    """
     layers, scales, turn = draw_layers(rng, files)
     mixtures: list[np.ndarray | None] = [None, None]
     if cross_modal and happens(rng, MIXED_SHARE):
@@ -176,7 +188,7 @@ def draw_pair(
 
 
 def photograph_view(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
-    """Change light, sharpness and noise of a (S, S) float32 view in [0, 1]; return uint8."""
+    """Change light, sharpness and noise of an (S, S) float32 view in [0, 1]; return uint8."""
     if happens(rng, UNCHANGED_SHARE):
         return np.clip(view * WHITE, 0, WHITE).astype(np.uint8)
     view = blur(rng, relight(rng, view, LIGHT), CAMERA)
@@ -184,7 +196,7 @@ def photograph_view(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
 
 
 def find_keypoints(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions (N, 2) and sigmas (N,) in pixels of a view's strongest candidates."""
+    """Return the positions (N, 2) and sigmas (N,), in pixels, of a view's strongest keypoints."""
     found = find_candidates(build_scale_space(view))
     inside = (found.xy > MARGIN_PX) & (found.xy < len(view) - 1 - MARGIN_PX)
     rows = np.flatnonzero(inside.all(1) & (found.sigma_px < MAX_FIRST_SIGMA_PX))
@@ -193,7 +205,7 @@ def find_keypoints(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_mixture(rng: np.random.Generator) -> np.ndarray:
-    """Draw the colour weights of a sensor, (1, 3) float32: one channel, or a mixture."""
+    """Draw the weights, (1, 3) float32, with which a simulated sensor adds the colour channels."""
     if happens(rng, ONE_COLOUR_SHARE):
         return np.eye(3, dtype=np.float32)[[int(rng.integers(3))]]
     weights = rng.normal(1 / 3, MIXTURE_DEVIATION, (1, 3)).astype(np.float32)
@@ -203,7 +215,8 @@ def draw_mixture(rng: np.random.Generator) -> np.ndarray:
 def change_tones(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
     """Change a view, (S, S) float32 in [0, 1], to what another sensor may see.
 
-    The view is inverted, changed by one tone curve or by two in different areas, or shown as edges.
+    The view is inverted, changed by one tone curve, changed by two tone curves that blend into each
+    other across the view, or shown as edges.
     """
 
     def curve() -> np.ndarray:

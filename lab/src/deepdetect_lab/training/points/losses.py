@@ -1,7 +1,8 @@
 """The loss of a pair of views: minus the expected fraction of keypoints that are found again.
 
-Candidates and their positions are fixed. Only their order is learned. The logits are scaled to a
-fixed standard deviation, so that larger logits alone do not lower the loss.
+Candidates and their positions are fixed. The network learns only to rank them, by a logit for each.
+The logits are scaled to a fixed standard deviation, so that larger logits alone do not lower the
+loss.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ SHARPNESS = 25.0
 larger logits alone do not lower it."""
 
 TEMPERATURE = 0.6
-"""Temperature of the soft choice of keypoints, in units of the logits. Chosen by hand."""
+"""Temperature of the sigmoid that maps scaled logits to probabilities. Chosen by hand."""
 
 CLOSE_SHARE = 0.7
-"""A keypoint gets this share of its reward only if it is found again within 1 px. For the rest, 3
-px suffice."""
+"""A keypoint gets this share of its reward only if it is found again within 1 px. It gets the rest
+of its reward if it is found again within 3 px."""
 
 MIN_CHOICE = 0.1
-"""Candidates that are chosen with a smaller probability get no partners in the other view. Chosen
-by hand."""
+"""Candidates that are chosen with a smaller probability than this have no partner in the other
+view, and are not the partner of another one. Chosen by hand."""
 
 MIN_SPREAD = 1e-3
 BISECTIONS = 40
 
 
 def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
-    """Return the loss of a pair of views, averaged over both directions.
+    """Return the loss of a pair of views, averaged over the directions from each to the other.
 
     Its value is minus the expected fraction of keypoints that are found again. Its gradient keeps
     the number of keypoints fixed: a candidate that becomes more likely displaces candidates near
@@ -59,9 +60,12 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
 
 
 def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
-    """Return the probability (N,) that each candidate is chosen; 0 if a better one is close."""
+    """Return the probability (N,) that each candidate is chosen.
+
+    It is 0 for candidates that are suppressed by a close one with a larger logit.
+    """
     logits = ranker(torch.from_numpy(view.features))
-    radii = least_distances(view.sigma_px)  # as at run time
+    radii = least_distances(view.sigma_px)  # the same as in detection
     kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))
     fixed = logits[kept].detach()
     spread = fixed.std() if len(fixed) > 1 else fixed.new_ones(())
@@ -70,7 +74,10 @@ def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Ten
 
 
 def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
-    """Return sigmoid((logits - tau) / temperature), with tau such that the sum is the budget."""
+    """Return sigmoid((logits - tau) / temperature), with tau such that the sum is `budget`.
+
+    If there are no more logits than the budget, all values are close to 1.
+    """
     fixed = logits.detach().double()
     if len(fixed) <= budget:
         return torch.sigmoid((logits - logits.detach().min()) / temperature + 4)
@@ -88,8 +95,9 @@ def _rewards(view: ViewCandidates, here: Tensor, there: Tensor) -> Tensor:
     """Return the reward (N,) of each candidate: the probability that its partner is chosen.
 
     The reward is lower if the partner is farther than 1 px away. Partners are mutual nearest
-    neighbours among the candidates that may be chosen, as in the validation. A sum over all near
-    candidates would reward clusters, and fewer points would be found again within 1 px.
+    neighbours among the candidates that may be chosen, as in the validation. If all near candidates
+    counted instead of one partner, the loss would reward clusters, and fewer keypoints would be
+    found again within 1 px.
     """
     pairs = mutual_pairs(view, NEAR_PX, here.numpy() > MIN_CHOICE, there.numpy() > MIN_CHOICE)
     close = view.distance_px[pairs] <= CLOSE_PX
@@ -103,15 +111,15 @@ def _rewards(view: ViewCandidates, here: Tensor, there: Tensor) -> Tensor:
 def mutual_pairs(
     view: ViewCandidates, radius_px: float, possible_here: np.ndarray, possible_there: np.ndarray
 ) -> np.ndarray:
-    """Return the indices of the pairs that are mutual nearest neighbours within a radius.
+    """Return which pairs of candidates are mutual nearest neighbours within a radius.
 
-    They index the P pairs of `view`. Candidates count only if they are marked in the masks
-    `possible_here` (N,) and `possible_there` (M,).
+    The result holds indices into `view.first` and `view.second`. Only candidates count that are
+    marked in the masks: `possible_here` (N,) for this view, `possible_there` (M,) for the other.
     """
     close = view.distance_px <= radius_px
     rows = np.flatnonzero(close & possible_here[view.first] & possible_there[view.second])
     rows = rows[np.argsort(view.distance_px[rows], kind="stable")]
-    # Rows are sorted by distance, so the first row of a candidate has its nearest neighbour.
+    # The pairs are sorted by distance, so the first pair of a candidate has its nearest neighbour.
     _, best_first = np.unique(view.first[rows], return_index=True)
     _, best_second = np.unique(view.second[rows], return_index=True)
     found: np.ndarray = rows[np.intersect1d(best_first, best_second)]

@@ -1,7 +1,8 @@
 """The validation metric of the ranker, on a fixed set of synthetic pairs.
 
-It uses the benchmark's functions for one-to-one repeatability at fixed budgets and for correct
-matches by upright descriptors. Points outside the photograph are dropped before the best are taken.
+The functions of the benchmark measure the one-to-one repeatability of fixed numbers of keypoints
+(budgets), and the correct matches of upright descriptors. Keypoints where a view does not show the
+photograph are dropped before the best ones are taken.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from ...evaluation.metrics.repeatability import mutual_nn_repeatability
 from .views import KINDS, ViewPair, draw_pair
 
 IMAGE_PIXELS = 800 * 640
-"""Budgets are numbers of keypoints for an image with this number of pixels. Smaller views get the
-same number per pixel."""
+"""The numbers of keypoints in `BUDGETS` are for an image with this number of pixels. Views with
+fewer pixels get proportionally fewer keypoints."""
 
 BUDGETS = (512, 2048, 8192)
 RADII_PX = (1.0, 3.0)
@@ -36,13 +37,14 @@ Detect = Callable[[np.ndarray], Keypoints]
 
 
 MEASURES = [f"@{radius:g} px {budget}" for budget in BUDGETS for radius in RADII_PX] + ["correct"]
-"""Measures of each kind of pair: the mean repeatability by radius and budget, and the mean fraction
-of `MATCHING_BUDGET` keypoints with correct matches. A match is correct within 1 px. Matches are
-mutual nearest neighbours of upright RootSIFT of size 4 that pass a ratio test at 0.85."""
+"""Names of the measures of each kind of pair. "@1 px 512" is the mean repeatability within 1 px at
+a budget of 512 keypoints. "correct" is the mean number of matches that are correct within 1 px,
+divided by the number of keypoints at `MATCHING_BUDGET`. These matches are mutual nearest neighbours
+of upright RootSIFT of size 4 that pass a ratio test at 0.85."""
 
 
 def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPair]:
-    """Draw the fixed set of pairs, each from a different image if there are enough."""
+    """Draw the fixed set of pairs, each from a different image if there are enough images."""
     order = np.random.default_rng([0, 1]).permutation(len(files))
     pairs = []
     for number in range(pairs_per_kind * len(KINDS)):
@@ -53,7 +55,7 @@ def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPai
 
 
 def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
-    """Return the "score" of a detector, and the value of "KIND MEASURE" for each combination."""
+    """Return the "score" of a detector, and each measure of each kind of pair, "KIND MEASURE"."""
     repeated: dict[str, list[list[list[float]]]] = {kind: [] for kind in KINDS}
     correct: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:
@@ -77,7 +79,8 @@ def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
         repeated[pair.kind].append(rows)
     means = np.array([np.mean(repeated[kind], axis=0) for kind in KINDS])
     matched = [float(np.mean(correct[kind])) for kind in KINDS]
-    # Upright descriptors match nothing in zoomed and rotated pairs, so `correct` counts double.
+    # Upright descriptors find no matches in zoomed and rotated pairs, which lowers the mean of
+    # `correct`, so it counts double.
     score = 0.8 * means.mean(0).mean() + 0.2 * 2 * float(np.mean(matched))
     found = {"score": float(score)}
     for kind, fractions, share in zip(KINDS, means, matched, strict=True):

@@ -18,12 +18,12 @@ from ..recipe import PointsTrainingOptions
 from .views import KINDS, ViewPair, draw_pair
 
 MAX_CANDIDATES = 2000
-"""Number of strongest candidates of each view that are ranked. Chosen by hand; not measured."""
+"""Views give at most this number of candidates, the strongest. Chosen by hand; not measured."""
 
 REACH_PX = 3.0
 
 MIN_OVERLAP = 0.04
-"""Pairs are drawn again if their views overlap by a smaller fraction. Chosen by hand; not
+"""Pairs whose views overlap by less than this fraction are drawn again. Chosen by hand; not
 measured."""
 
 ATTEMPTS = 5
@@ -31,15 +31,19 @@ ATTEMPTS = 5
 
 @dataclass(frozen=True, eq=False)
 class ViewCandidates:
-    """The candidates of one view, and the close pairs of them with candidates of the other view.
+    """The candidates of one view, and their possible correspondences in the other view.
+
+    A candidate of this view is mapped to the other view, and paired with each candidate of the
+    other view that is closer than `REACH_PX`.
 
     Attributes:
-        xy: (N, 2) float64 positions.
+        xy: (N, 2) float64 positions in pixels.
         sigma_px: (N,) float64 scales.
-        features: (N, F) float32.
+        features: (N, F) float32 inputs of the ranker.
         visible: (N,) bool, whether the other view shows the candidate's position.
-        first, second: (P,) int64 rows of the close candidates in this and in the other view.
-        distance_px: (P,) distances between close candidates, in pixels of the other view.
+        first: (P,) int64, for each pair the row of its candidate in this view.
+        second: (P,) int64, for each pair the row of its candidate in the other view.
+        distance_px: (P,) distances in the pairs, in pixels of the other view.
     """
 
     xy: np.ndarray
@@ -53,7 +57,7 @@ class ViewCandidates:
 
 @dataclass(frozen=True, eq=False)
 class CandidatePair:
-    """Two views of one image, and the number of keypoints that each is trained to keep."""
+    """Two views of one image, and the number of keypoints to keep in each of them."""
 
     views: tuple[ViewCandidates, ViewCandidates]
     budget: float
@@ -86,7 +90,7 @@ def _correspondences(
 ) -> tuple[np.ndarray, ...]:
     mapped = np.column_stack([here, np.ones(len(here))]) @ (homography / homography[2, 2]).T
     depth = mapped[:, 2:]
-    before = depth[:, 0] > 0  # others lie behind the camera of the tilted view
+    before = depth[:, 0] > 0  # other positions lie behind the camera
     mapped = np.where(before[:, None], mapped[:, :2] / np.where(before[:, None], depth, 1), -1e6)
     height, width = valid.shape
     column, row = np.rint(np.clip(mapped, -1e6, 1e6)).astype(np.int64).T
@@ -94,7 +98,7 @@ def _correspondences(
     rows = rows[valid[row[rows], column[rows]]]
     visible = np.zeros(len(here), bool)
     visible[rows] = True
-    # For a few thousand candidates, computing all distances is faster than a tree.
+    # For a few thousand candidates, computing all distances is faster than searching a tree.
     squared = np.square(mapped[rows, :1] - there[:, 0]) + np.square(mapped[rows, 1:] - there[:, 1])
     near, second = np.nonzero(squared < REACH_PX**2)
     first, distance = rows[near], np.sqrt(squared[near, second])
@@ -102,7 +106,7 @@ def _correspondences(
 
 
 class PairDataset(Dataset[CandidatePair]):
-    """Random pairs of views. Each is a pure function of the seed, the step and its number there."""
+    """Random pairs of views, each determined by the seed, the step, and its number in the step."""
 
     def __init__(self, files: Sequence[Path], options: PointsTrainingOptions) -> None:
         self.files, self.options = list(files), options
@@ -123,7 +127,7 @@ class PairDataset(Dataset[CandidatePair]):
 
 
 def overlap(pair: ViewPair) -> float:
-    """Return the fraction of a view that the other view also shows; the smaller of both."""
+    """Return the fraction of a view that the other view also shows: the smaller of both values."""
     side = pair.images[0].shape[0]
     ticks = np.linspace(0, side - 1, 24)
     grid = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)

@@ -27,29 +27,29 @@ from .measure import measure, validation_pairs
 from .pairs import CandidatePair, PairDataset
 
 STATISTICS_PAIRS = 64
-"""Number of pairs from whose features the mean and standard deviation for the normalisation are
-computed. Chosen by hand."""
+"""Features are normalised by their statistics in this number of pairs of views. Chosen by hand."""
 
 WARM_UP_STEPS = 100
 FINAL_RATE = 0.02
-"""Cosine annealing ends at this fraction of the learning rate. Chosen by hand; not measured."""
+"""Cosine annealing ends at this fraction of the highest learning rate. Chosen by hand; not
+measured."""
 
 WEIGHT_DECAY = 1e-4
 
 AVERAGE_DECAY = 0.995
-"""Decay per step of the weights' exponential average, which is saved. Chosen by hand."""
+"""Decay per step of the exponentially averaged weights, which are saved. Chosen by hand."""
 
 HIDDEN_UNITS = (48, 32)
 MIN_DEVIATION = 1e-3
 INITIAL_OUTPUT = 0.01
-"""The initial weights of the last layer are scaled by this factor to nearly 0. So an untrained
-ranker ranks by |det Hessian|."""
+"""The initial weights of the last layer are multiplied by this factor. The layer then gives values
+near 0, so an untrained ranker ranks by |det Hessian|."""
 
 
 class RankerModule(nn.Module):
-    """A ranker: its logit is the first feature plus the output of a perceptron of all features.
+    """A ranker. Its logit is the first feature plus the output of a perceptron for all features.
 
-    The features are normalised by their `mean` and standard `deviation`, (F,) each.
+    The perceptron gets features normalised by their `mean` and standard `deviation`, (F,) each.
     """
 
     mean: Tensor
@@ -87,7 +87,7 @@ class RankerModule(nn.Module):
 
 
 def save_ranker(ranker: Ranker, path: Path) -> None:
-    """Write a ranker as an npz file for `load_ranker`; equal rankers give equal bytes."""
+    """Write a ranker as an npz file for `load_ranker`. Equal rankers give identical files."""
     arrays = {"mean": ranker.mean, "deviation": ranker.deviation}
     for k, (weight, bias) in enumerate(ranker.layers):
         arrays |= {f"weight{k}": weight, f"bias{k}": bias}
@@ -96,14 +96,14 @@ def save_ranker(ranker: Ranker, path: Path) -> None:
 
 
 class RankerTrainer(Trainer):
-    """Training of a ranker of keypoints on views of images."""
+    """Training of a ranker of keypoints on pairs of synthetic views of images."""
 
     objective, sign = "score", -1
-    purpose = "that ranks maxima of |det Hessian| by how surely they are found again"
+    purpose = "that ranks maxima of |det Hessian| by how likely other views show them again"
     measures = (
-        "On pairs of views of the validation images, by kind: one-to-one repeatability within 1 "
-        "and 3 px by number of keypoints (for an image of 800x640), and matches correct to 1 px "
-        "over the number of keypoints"
+        "For each kind of pairs of views of the validation images: one-to-one repeatability "
+        "within 1 and 3 px for several numbers of keypoints (in an image of 800x640 pixels), and "
+        "the number of matches correct within 1 px divided by the number of keypoints"
     )
     weights_file = "best.npz"
     max_gradient_norm = 1.0
@@ -138,7 +138,7 @@ class RankerTrainer(Trainer):
         self.notes = {"images": str(len(self.files))}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return the loader of the batches of some steps: lists of `CandidatePair`."""
+        """Return a loader of the batches for steps `first` to `last` - 1, lists of pairs."""
         steps, pairs = range(first, self.steps if last is None else last), range(self.options.pairs)
         return DataLoader(
             PairDataset(self.files, self.options),
@@ -149,7 +149,10 @@ class RankerTrainer(Trainer):
         )
 
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
-        """Return the mean loss of some pairs; pairs with a view without candidates count as 0."""
+        """Return the mean loss of pairs.
+
+        A pair counts as 0 if a view has fewer than two candidates.
+        """
         losses = [
             pair_loss(self.network, pair)
             for pair in batch
@@ -166,7 +169,7 @@ class RankerTrainer(Trainer):
         return rate * min(1.0, (step + 1) / WARM_UP_STEPS)
 
     def validate(self, step: int) -> dict[str, float]:
-        """Measure the average of the weights so far."""
+        """Measure the averaged weights on the validation pairs."""
         return measure(partial(detect_points, ranker=self.average.export({})), self.pairs)
 
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:

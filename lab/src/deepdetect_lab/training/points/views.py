@@ -1,8 +1,8 @@
 """Synthetic pairs of views of one photograph, with the homography between them.
 
 Pairs have one of four kinds of change, as the Oxford scenes have: zoom and rotation, blur,
-viewpoint, or light and JPEG. Each kind also gets a little of the other changes. A pair only depends
-on photograph, kind, size and generator.
+viewpoint, or light and JPEG. Each kind also gets a little of the other changes. A pair depends only
+on the photograph, the kind, the size and the random generator.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from ..synthetic import (
 KINDS = ("zoom", "blur", "viewpoint", "light")
 
 BORDER_PX = 4
-"""Candidates within this distance of the photograph's border are not valid, because their
-surroundings include mirrored pixels."""
+"""Pixels of a view are not valid near the border of the photograph, because the surroundings of a
+candidate there include mirrored pixels. The margin is this number of pixels of the photograph, plus
+as many pixels of the view."""
 
 SUPERSAMPLING = 2
 """Views are rendered with twice the pixels along each side, so that they are not aliased."""
@@ -41,8 +42,8 @@ MAX_ENLARGEMENT = 2.2
 """Zoomed views enlarge the photograph by at most this factor, because more would only show blur."""
 
 SUBTLE = 0.25
-"""Share of the views that get a weak blur, light change or JPEG compression although their kind is
-another. Chosen by hand."""
+"""A view whose kind is not "blur" gets a weak blur with this probability. The same holds for
+changes of light and for JPEG compression. Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),
@@ -53,9 +54,9 @@ CAMERAS = {
     "blur": replace(CAMERA, blur=Effect(1, 0.5, 4.5)),
     "light": replace(CAMERA, jpeg=Effect(0.5, 5, 60)),
 }
-"""The first is blur, noise and JPEG compression of a normal view. The second is that of the worse
-view of a pair, by its kind. Oxford's JPEG quality goes from 40 to 2, but below 5 little is left of
-a view of 224 pixels."""
+"""`CAMERA` is the blur, noise and JPEG compression of most views. `CAMERAS` replaces it, for the
+kinds "blur" and "light", in the worse view of a pair. The JPEG quality of the Oxford scenes goes
+from 40 to 2, but below 5 little is left of a view of 224 pixels."""
 
 LIGHT = Light(
     log_gamma=Effect(1, -0.8, 0.8),
@@ -70,23 +71,23 @@ SUBTLE_LIGHT = Light(
     ramp=Effect(1, 0, 0.24),
     shift=(-0.015, 0.03),
 )
-"""The first is the light of the worse view of kind "light", with a gain down to a fifth. The second
-is the light of all other views, with 0.3 times the ranges."""
+"""`LIGHT` changes the worse view in a pair of the kind "light". Its gain goes down to a fifth.
+`SUBTLE_LIGHT` is for all other views. Its ranges are 0.3 times as large."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """Changes from the first to the second view of a kind.
+    """Changes from the first to the second view in pairs of one kind.
 
     Attributes:
         log_zoom: range of the logarithm of the zoom.
         turn_deg: the largest rotation in either direction, in degrees.
         shift: the largest distance between the centres along each axis, in sides of the first view.
-        any_turn: share of the pairs that are rotated by any angle.
+        any_turn: share of the pairs that are rotated by any angle, up to 180 degrees.
         tilt_deg: range of the tilt in degrees.
         still: share of the pairs with neither zoom nor rotation nor tilt.
-        scales: largest scale of first views: 0 is the scale that shows the whole shorter side of
-            the photograph, 1 the largest scale, logarithmically in between.
+        scales: upper end of the range of the first view's scale, logarithmic from 0 to 1. At 0 the
+            view shows the whole shorter side of the photograph. At 1 it has the largest scale.
     """
 
     log_zoom: tuple[float, float]
@@ -99,36 +100,36 @@ class Change:
 
 
 CHANGES = {
-    # First views are taken at small scales, so that the zoomed second views are not blurred.
+    # First views show much of the photograph (`scales`), so that zoomed views are not blurred.
     "zoom": Change((math.log(1.2), math.log(4.0)), 180, 0.3, tilt_deg=(0, 15), scales=0.3),
     "blur": Change((-0.1, 0.1), 6, 0.08),
     "viewpoint": Change((-0.25, 0.25), 25, 0.15, any_turn=0.35, tilt_deg=(15, 60)),
     "light": Change((-0.03, 0.03), 2, 0.08, still=0.3),
 }
-"""Changes by kind. They go up to the largest changes of the Oxford scenes, a viewpoint change of 60
-degrees and a zoom of 4."""
+"""Changes between the views of a pair, by kind. They go up to the largest changes in the Oxford
+scenes: a viewpoint change of 60 degrees and a zoom of 4."""
 
 LEAST_LOG_ZOOM = math.log(1.3)
-"""Logarithm of a zoom that is always allowed, even if the second view is then enlarged by more than
+"""Zooms up to this logarithm are always allowed, even if they enlarge the photograph by more than
 `MAX_ENLARGEMENT`."""
 
 ROTATED_SHARE = 0.2
-"""Share of the pairs of which both views are rotated together by any angle. Chosen by hand."""
+"""Share of the pairs in which one random rotation is added to both views. Chosen by hand."""
 
 FOCAL_SIDES = (1.2, 3.0)
-"""Range of the focal length, in sides of the view. It gives fields of view from 45 to 19
-degrees."""
+"""Range of the focal length, in sides of the view: fields of view from 45 to 19 degrees."""
 
 SHRUNK_SCALE, LEAST_SIDE_PX = 0.9, 8
-"""A photograph is first shrunk by area averaging if the view's scale is below the first number. Its
-sides keep at least the second number of pixels."""
+"""If a view shows the photograph at a scale below `SHRUNK_SCALE`, the photograph is first shrunk to
+this scale by area averaging. Its sides keep at least `LEAST_SIDE_PX` pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPair:
-    """Two views of one photograph, (H, W) uint8, and the pixels that show it, (H, W) bool.
+    """Two grey views of one photograph, (H, W) uint8, with the homography between them.
 
-    The homography (3, 3) maps the first view to the second.
+    `valid` holds a mask (H, W) of each view: the pixels that show the photograph. The homography
+    (3, 3) maps positions in the first view to the second.
     """
 
     images: tuple[np.ndarray, np.ndarray]
@@ -158,10 +159,10 @@ def tilted_view(
 
 
 def draw_pair(photo: np.ndarray, kind: str, side: int, generator: np.random.Generator) -> ViewPair:
-    """Draw two square views, of `side` pixels a side, of a photograph, (H, W) uint8 grey."""
+    """Draw two square views with `side` pixels a side of a grey photograph, (H, W) uint8."""
     matrices = _draw_homographies(photo.shape, kind, side, generator)
     rendered = [render(photo, matrix, side) for matrix in matrices]
-    affected = int(generator.integers(2))  # the view that has most of the blur or of the light
+    affected = int(generator.integers(2))  # the view with the strong blur or light change
     images = [degrade(rendered[k][0], kind if k == affected else "", generator) for k in range(2)]
     homography = matrices[1] @ np.linalg.inv(matrices[0])
     return ViewPair(
@@ -178,7 +179,7 @@ def _draw_homographies(
     """Draw the homographies from the photograph to both views."""
     change, uniform = CHANGES[kind], generator.uniform
     size = np.array(shape[::-1])
-    smallest = side / size.min()  # shows all of the photograph's shorter side
+    smallest = side / size.min()  # the scale that shows the whole shorter side
     least, most = change.log_zoom
     largest_zoom = max(math.log(MAX_ENLARGEMENT / smallest), LEAST_LOG_ZOOM)
     zoom = math.exp(uniform(least, min(most, largest_zoom)))
@@ -202,7 +203,7 @@ def _draw_homographies(
 
 
 def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render a view without aliasing; return (side, side) uint8 and its valid pixels as bool."""
+    """Render a view without aliasing; return it, (side, side) uint8, and its valid pixels."""
     height, width = photo.shape
     x, y, w = np.linalg.solve(matrix, [(side - 1) / 2, (side - 1) / 2, 1])
     center = np.array([x / w, y / w])
@@ -233,7 +234,7 @@ def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray
 
 
 def degrade(image: np.ndarray, kind: str, generator: np.random.Generator) -> np.ndarray:
-    """Degrade a view, (H, W) uint8, strongly by its kind, and now and then weakly by other kinds.
+    """Degrade a view, (H, W) uint8: strongly as its kind says, and sometimes weakly in other ways.
 
     The kind is "" for the better view of a pair, which is only degraded weakly.
     """
