@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from .errors import MissingExtraError, first_line, require_packages
 from .signals import sigterm_kept
 
-LOWEST_VERSION = "4.12"
-"""Lowest supported version of OpenCV: older ones cannot write EXIF data into an image."""
+LOWEST_VERSION = "4.13"
+"""Lowest supported version of OpenCV: 4.12 silently writes images without their ICC profiles."""
 
 DISTRIBUTIONS = (
     "opencv-python",
