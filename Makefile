@@ -8,8 +8,6 @@ TORCH := torch==2.13.0
 # Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
 # that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
 PYTEST := -m pytest -q -n 2 --dist loadfile --max-worker-restart 0
-# What sends signals to its own process runs alone: after other tests in one process it ended the process.
-ALONE := tests/tracking/test_pipeline.py
 export OMP_NUM_THREADS ?= 1
 export UV_PYTHON_DOWNLOADS ?= never
 # The tests start many interpreters: what one has compiled, the next should find.
@@ -36,17 +34,15 @@ demo: $(VENV)/.demo
 
 # The fast tests. Those marked as slow run with `make test-all`.
 test: $(VENV)/.test
-	$(VENV)/bin/python -m pytest -q $(ALONE)
-	$(VENV)/bin/python $(PYTEST) --deselect $(ALONE)
+	$(VENV)/bin/python $(PYTEST)
 
-# The fast tests, and the lines that they run. One process: of two that are measured, one may crash.
+# The fast tests, and the lines that they run.
 coverage: $(VENV)/.test
-	$(VENV)/bin/python -m pytest -q --cov --cov-report term:skip-covered
+	$(VENV)/bin/python $(PYTEST) --cov --cov-report term:skip-covered
 
 # All tests, and ten minutes of wrong input and kills.
 test-all: $(VENV)/.test test-opencv4 test-ray test-integrations onnxruntime
-	$(VENV)/bin/python -m pytest -q --runslow $(ALONE)
-	$(VENV)/bin/python $(PYTEST) --runslow --deselect $(ALONE)
+	$(VENV)/bin/python $(PYTEST) --runslow
 	$(VENV)/bin/python -m fuzz --seconds 540 --kills 8
 
 # All wrong input and all kills of docs/limits.md: a quarter of an hour on two cores.

@@ -25,6 +25,13 @@ COMPILED_LAYERS = 100
 least recently. OpenVINO's default, 5000, would fill 0.5 GB if image sizes vary."""
 
 
+_CORES: list[Any] = []
+"""The core of OpenVINO that all models share; empty before the first model, and after memory has
+run out, because compiling in the same core would then crash. Deleting cores in the order in which
+they were made leaves the thread with a signal stack that is freed, and the next signal that Python
+handles, such as Ctrl-C, would end the process (OpenVINO 2026.4; findings/openvino_cores.sh)."""
+
+
 class OpenVinoNetwork:
     """A network run by OpenVINO on the CPU.
 
@@ -53,10 +60,12 @@ class OpenVinoNetwork:
             output = request.infer([image], share_inputs=True)[self._output_name]
         except Exception as error:  # OpenVINO's exceptions share no base class
             self._model = None
+            _CORES.clear()
             raise failed_run(error, image.shape) from None
         # If memory is short, OpenVINO may also return nothing, or the previous image's map.
         if self._works and output.shape[2:] != image.shape[2:]:
             self._model = None
+            _CORES.clear()
             raise MemoryError("OpenVINO gave a map of another size than the image")
         logits = as_logits(output, self._output_name, image.shape, self._path)
         self._works = True
@@ -93,8 +102,9 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         reader = FrontEndManager().load_by_framework("onnx")
         graph = reader.convert(reader.load(str(path)))
         _keep_what_is_read(graph)
-        # Each compilation uses a new core, because one that has run out of memory crashes.
-        return openvino.Core().compile_model(graph, "CPU", settings)
+        if not _CORES:
+            _CORES.append(openvino.Core())
+        return _CORES[0].compile_model(graph, "CPU", settings)
 
     try:
         return OpenVinoNetwork(compile_model, path, options)
