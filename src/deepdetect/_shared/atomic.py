@@ -19,12 +19,10 @@ from pathlib import Path
 from .errors import DeepDetectError
 
 ABANDONED_S = 24 * 3600.0
-"""A temporary file that another machine made counts as abandoned if it is older than this, in
-seconds. Chosen by hand."""
+"""A temporary file of another machine is removed at this age, in seconds. Chosen by hand."""
 
 STEM_LENGTH = 40
-"""A temporary name repeats at most this many characters of the final name, because a longer name
-could exceed the file system's limit."""
+"""A temporary name has this many characters of the final name, because file systems limit names."""
 
 # The owner in a temporary name is a machine, a process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
@@ -40,8 +38,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     Missing folders are created. Temporary files that killed processes left there are removed.
 
     Raises:
-        DeepDetectError: the file cannot be written: there is no permission or no space, or its
-            parent is not a folder.
+        DeepDetectError: the file cannot be written.
     """
     final = Path(path)
     temporary = final.with_name(f".{final.stem[:STEM_LENGTH]}.{_owner()}.part{final.suffix}")
@@ -93,7 +90,7 @@ def _clear(folder: Path) -> None:
 
 
 def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
-    """List what matches `names` in a folder and was made by a process that has ended."""
+    """List the paths in a folder that match `names` and were made by a process that has ended."""
     # `glob` finds nothing in a folder that is missing or cannot be listed.
     matches = [(path, names.fullmatch(path.name)) for path in folder.glob("*")]
     return [path for path, match in matches if match and _has_ended(path, **match.groupdict())]
@@ -108,18 +105,17 @@ def _has_ended(path: Path, machine: str, process: str) -> bool:
     try:
         if machine != _machine() or os.name != "posix":
             return time.time() - path.lstat().st_mtime > ABANDONED_S
-        os.kill(int(process), 0)  # only checks that the process exists
+        os.kill(int(process), 0)  # signal 0 only checks that the process exists
         # In a container without init, workers of a killed process remain as zombies (state Z).
         state = Path(f"/proc/{process}/stat")
         return state.is_file() and state.read_text().rpartition(")")[2].split()[0] == "Z"
     except ProcessLookupError:
         return True
-    except (OSError, OverflowError):  # it is another user's, or the file is gone
+    except (OSError, OverflowError):  # the process is another user's, or the file is gone
         return False
 
 
 def _owner() -> str:
-    """Return the owner for a new temporary name: this machine, this process, a random number."""
     return f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
 
 

@@ -36,14 +36,11 @@ class WeightsError(DeepDetectError, ValueError):
 
 
 class ReconstructionError(DeepDetectError, ValueError):
-    """A reconstruction fails; the message gives the reason. It is a `ValueError`."""
+    """A reconstruction fails for the reason in the message; a `ValueError`."""
 
 
 class NoDepthError(ReconstructionError):
-    """The options are valid, but the images show no depth or do not overlap.
-
-    The command line ends with exit code 3.
-    """
+    """The images show no depth or do not overlap; the command line ends with exit code 3."""
 
 
 class MissingExtraError(DeepDetectError, ImportError):
@@ -71,13 +68,13 @@ class MissingCalibrationError(ReconstructionError, MissingFileError):
 
 
 class InvalidFileError(DeepDetectError, ValueError):
-    """A file is damaged, or is not of the expected kind. It is a `ValueError`."""
+    """A file is damaged, or is not of the expected kind; a `ValueError`."""
 
 
 class BatchError(DeepDetectError):
     """Some of many files could not be processed; the others are done.
 
-    The command line lists them and ends with exit code 1.
+    The command line lists the failures, and ends with exit code 1.
 
     Args:
         summary: how many files failed, and what happened to the others.
@@ -109,7 +106,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
 
 
 def check_name(kind: str, name: object, known: Collection[object]) -> None:
-    """Raise an OptionError if a name is unknown; `kind` is what it names, such as "projection"."""
+    """Raise an OptionError if a name is unknown; `kind` is the kind of names, such as "option"."""
     if name not in known:
         raise unknown_name(kind, name, map(str, known))
 
@@ -149,9 +146,9 @@ def require_packages(what: str, *packages: str) -> None:
 
 @contextmanager
 def noted_failures(name: str, failures: list[str]) -> Iterator[None]:
-    """If the block fails for the input `name`, note the error, so that other inputs are processed.
+    """If the block fails for the input `name`, add the error to `failures` instead of raising it.
 
-    Errors that would affect all inputs, a missing package or wrong weights, are still raised.
+    Errors that affect all inputs, such as a missing package or wrong weights, are still raised.
     """
     try:
         yield

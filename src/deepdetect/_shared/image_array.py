@@ -14,8 +14,7 @@ Channels = Literal["rgb", "bgr"]
 CHANNEL_COUNTS = (1, 3, 4)
 
 SENSOR_BITS = (8, 10, 12, 14, 16)
-"""Possible bit depths of sensors whose images are stored as uint16. The smallest depth that can
-hold all values of an image is assumed."""
+"""Bit depths of sensors. A uint16 image is assumed to have the smallest that holds its values."""
 
 LITTLE_RANGE = 1 / 8
 """An image whose largest value is less than this fraction of white causes a warning, because it is
@@ -31,8 +30,7 @@ def as_array(image: Any) -> np.ndarray:
     """Return an array-like, or a PyTorch tensor on any device, as a NumPy array.
 
     Raises:
-        ImageError: the value is None, an iterator, a sparse or meta tensor, or a list of rows of
-            different lengths.
+        ImageError: the value is None, an iterator, a sparse or meta tensor, or of ragged rows.
     """
     if image is None:
         raise ImageError("the image is None, as `cv2.imread` returns for a missing file: check it")

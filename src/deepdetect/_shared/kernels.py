@@ -27,7 +27,7 @@ def announce_compilation(tell: Callable[[], object]) -> None:
 
 @functools.cache
 def _listen() -> None:
-    """Call the announcement at numba's first compilation; loading a cached kernel is not one."""
+    """Call the announcement when numba first compiles a kernel instead of loading a cached one."""
     from numba.core import event as events
 
     class Listener(events.Listener):
@@ -45,7 +45,7 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function by `numba.njit` at its first call, and caches it.
 
     Raises:
-        MissingExtraError: numba cannot be imported; it may not support this version of NumPy.
+        MissingExtraError: numba is missing, or does not support the installed version of NumPy.
     """
     try:
         import numba
@@ -58,7 +58,7 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     config: Any = numba.config  # type checkers do not know its settings
 
     def decorate(function: Callable[..., Any]) -> Any:
-        with suppress(RuntimeError):  # numba found no writable folder
+        with suppress(RuntimeError):  # numba found no writable cache folder
             return numba.njit(cache=True, **flags)(function)
         before = config.CACHE_DIR
         try:
@@ -74,12 +74,9 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _temporary_folder() -> Path:
-    """Return a folder in the temporary directory that only this user can write.
+    """Return a temporary folder that only this user can write, or raise an OSError.
 
     Anyone who can write to a cache of compiled code can make this process run any code.
-
-    Raises:
-        OSError: the folder cannot be created, or others can write to it.
     """
     folder = Path(tempfile.gettempdir()) / f"deepdetect-numba-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)

@@ -1,8 +1,7 @@
 """Processors and memory of this machine: parallel work, and how much memory is free.
 
-joblib is not used, because its workers finish their task even if the parent is killed. The modules
-that start processes are imported only when needed, because importing them takes a tenth of the time
-and memory that loading a detector takes.
+joblib is not used, because its workers finish their task even if the parent is killed.
+multiprocessing is imported only when needed, because its import takes time and memory.
 """
 
 from __future__ import annotations
@@ -32,19 +31,16 @@ Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
 PARTS_PER_THREAD = 4
-"""`parallel_for` divides a range into this many parts per thread, so that a thread that is done
-early can take more of them."""
+"""`parallel_for` makes this many parts per thread, so that a thread that ends early takes more."""
 
 TASKS_PER_WORKER = 8
-"""`map_in_processes` submits this number of tasks per worker ahead, so that all workers stay busy
-while it waits for the outcome of the oldest task. Chosen by hand."""
+"""`map_in_processes` queues this many tasks per worker, so that no worker idles. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""When the work is interrupted or fails, running tasks have this many seconds to end before their
-processes are killed."""
+"""If the work is interrupted or fails, workers that still run are killed after these seconds."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Environment variables from which libraries take their number of threads when they are loaded."""
+"""Environment variables that set the number of threads of libraries when they are loaded."""
 
 BYTES_PER = {
     # The descriptor of a keypoint, and its part of a matcher's search trees.
@@ -54,7 +50,7 @@ BYTES_PER = {
     "blended_pixel": 30,
     # A pixel of a scale-space level: two float32 maps, and arrays derived from them.
     "pixel_of_level": 16,
-    # Peaks of dense matching, and of the fusion of depth maps.
+    # A pixel of an image in dense matching, and of a depth map in the fusion of depth maps.
     "dense_pixel": 250,
     "fused_pixel": 500,
 }
@@ -64,7 +60,7 @@ DEFAULT_MEMORY = 4_000_000_000
 """Bytes of memory assumed to be available if the system does not report them."""
 
 # M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no block is mapped on its own, and the
-# heap is never trimmed and grows by 256 MB.
+# heap is never trimmed, and grows in steps of 256 MB.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
 _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
 
@@ -72,7 +68,7 @@ _max_threads: int | None = None
 """`parallel_for` uses at most this number of threads in this process; None: one per processor."""
 
 _chosen = threading.local()
-"""Its attribute `threads` is what `limited_threads` has set in the current thread."""
+"""The attribute `threads` is the limit that `limited_threads` has set in the current thread."""
 
 
 TaskMap = Callable[..., Iterator[Any]]
@@ -191,7 +187,7 @@ def use_one_thread() -> None:
 
 @contextmanager
 def limited_threads(threads: int | None) -> Iterator[None]:
-    """Limit the threads of calls that this thread makes in the block; None: no new limit."""
+    """Limit how many threads each call in the block uses; None sets no new limit."""
     before = getattr(_chosen, "threads", None)
     _chosen.threads = threads or before
     try:
@@ -209,7 +205,7 @@ def thread_limit() -> int | None:
     """
     if chosen := getattr(_chosen, "threads", None):
         return int(chosen)
-    # A process started by multiprocessing has loaded this module; others need not import it.
+    # multiprocessing is not imported here, because its child processes have imported it before.
     parent_of = getattr(sys.modules.get("multiprocessing.process"), "parent_process", None)
     wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     if _max_threads is None and wished.isdecimal() and int(wished):
@@ -222,7 +218,7 @@ def thread_limit() -> int | None:
 
 
 def end_with_parent(end: Callable[[], object] = lambda: None) -> None:
-    """End this process when its parent has ended; call `end` just before."""
+    """When the parent process has ended, call `end`, then end this process."""
     import multiprocessing
 
     def wait(parent: BaseProcess) -> None:
@@ -270,16 +266,12 @@ def available_memory() -> int:
 
 
 def needed_memory(**counts: float) -> float:
-    """Return the bytes that a step needs; `counts` are numbers of items named as in `BYTES_PER`."""
+    """Return the bytes that a step needs for given numbers of items, named as in `BYTES_PER`."""
     return sum(BYTES_PER[name] * count for name, count in counts.items())
 
 
 def require_memory(what: str, advice: str, **counts: float) -> None:
-    """Check that a step fits in the available memory; `counts` are as in `needed_memory`.
-
-    Raises:
-        OptionError: the step needs more memory than is available.
-    """
+    """Raise an OptionError if a step needs more memory than is available; see `needed_memory`."""
     needed = needed_memory(**counts)
     if needed > available_memory():
         raise OptionError(
@@ -290,9 +282,8 @@ def require_memory(what: str, advice: str, **counts: float) -> None:
 def disable_malloc_trim() -> None:
     """Let this process keep the memory that it frees, if the C library is glibc.
 
-    By default, glibc returns large freed blocks to the system at once, and the system clears each
-    page of new blocks. Clearing takes a fifth of the time of a training step on the CPU, and a
-    sixth of the time of labelling.
+    By default, glibc returns large freed blocks to the system, which clears the pages of new ones.
+    Clearing takes a fifth of the time of a training step on the CPU.
     """
     if platform.libc_ver()[0] == "glibc":
         for option, value in _MALLOPT:

@@ -1,6 +1,6 @@
 """OpenCV, imported at its first use, from whichever of its PyPI packages is installed.
 
-These packages share one folder `cv2`: a package overwrites the files of one installed before. The
+The packages share one folder `cv2`, so a package overwrites the files of one installed before. The
 modules of DeepDetect write `from .._shared.opencv import cv2`.
 """
 
@@ -44,11 +44,7 @@ else:
 
 @functools.cache
 def import_opencv() -> ModuleType:
-    """Import OpenCV.
-
-    Raises:
-        MissingExtraError: OpenCV is missing, cannot be imported, or is too old.
-    """
+    """Import OpenCV, or raise a MissingExtraError if it is missing, broken or too old."""
     try:
         found = importlib.import_module("cv2")
     except ImportError as error:
@@ -84,7 +80,7 @@ def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
 
 
 def is_lack_of_memory(error: Exception) -> bool:
-    """Return whether OpenCV raised this error for lack of memory; do not import it to find out."""
+    """Return whether OpenCV raised this error for lack of memory, without importing OpenCV."""
     loaded = sys.modules.get("cv2")
     wanted = loaded is not None and isinstance(error, loaded.error)
     return wanted and getattr(error, "code", None) == cv2.Error.StsNoMem
@@ -93,10 +89,8 @@ def is_lack_of_memory(error: Exception) -> bool:
 def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
     """Return a factory function of OpenCV, such as "AgastFeatureDetector_create".
 
-    OpenCV 5 moved some of them from `cv2` to `cv2.xfeatures2d`, one of the contrib modules.
-
-    Raises:
-        MissingExtraError: the factory is in the contrib modules, which are not installed.
+    OpenCV 5 has some factories in a contrib module, `cv2.xfeatures2d`. Raises a MissingExtraError
+    if the contrib modules are needed but not installed.
     """
     for home in (cv2, getattr(cv2, "xfeatures2d", None)):
         if hasattr(home, name):
@@ -113,7 +107,7 @@ def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
 
 def installed_distributions() -> list[str]:
     """Return the installed packages that contain `cv2`."""
-    import importlib.metadata  # late: it takes longer than importing DeepDetect
+    import importlib.metadata  # late, because it is slow to import
 
     installed = {each.name for each in importlib.metadata.distributions()}
     return [name for name in DISTRIBUTIONS if name in installed]

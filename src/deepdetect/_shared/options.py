@@ -29,10 +29,9 @@ def suggest_keywords(
 ) -> Callable[Parameters, Result]:
     """Decorate a function so that an unknown keyword raises an error that suggests a known one.
 
-    An argument of a wrong type also raises an error, if its annotation consists only of types in
-    `ACCEPTED` or dataclasses. The function keeps its signature. A class is decorated above
-    `@dataclass`, and stays the same class. `elsewhere` maps keywords that only other functions have
-    to advice on what to do instead.
+    An argument of a wrong type also raises an error if its annotation has only types in `ACCEPTED`
+    and dataclasses. If `function` is a class, its `__init__` is decorated. `elsewhere` maps
+    keywords of other functions to advice on what to do instead.
     """
     if isinstance(function, type):
         kind: Any = function
@@ -64,7 +63,7 @@ def shown(value: object) -> str:
 
 ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     bool: (bool, np.bool_),
-    int: (Real,),  # `check_ranges` checks that they are whole
+    int: (Real,),  # `check_ranges` checks that the numbers are whole
     float: (Real,),
     str: (str,),
     Path: (os.PathLike,),
@@ -72,10 +71,10 @@ ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     Callable: (Callable,),
     Mapping: (Mapping,),
 }
-"""The types that a value may have, by the type in the annotation; NumPy's types are included."""
+"""For each type in an annotation, the types of the values that are accepted."""
 MADE_LATER = type(functools.cache(len))
-"""Type of functions decorated with `functools.cache`. Such a function is accepted in place of an
-object, for example keypoints, which it makes at the first use."""
+"""Type of functions decorated with `functools.cache`. An argument may be such a function instead of
+an object, for example keypoints; the function makes the object at the first use."""
 KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable, Mapping: Mapping}
 
 
@@ -97,12 +96,10 @@ def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
 
 
 def numbers_of(name: str, value: Any, kind: type | None, columns: int | None = None) -> np.ndarray:
-    """Return numbers as an array of the type `kind`, or of their own type if it is None.
+    """Return numbers as an array of the type `kind`; if `kind` is None, keep their own type.
 
-    If `columns` is given, the array is two-dimensional with this number of columns.
-
-    Raises:
-        OptionError: the value is not numeric, or its numbers do not fill whole rows.
+    If `columns` is given, the array has two dimensions and this many columns. Raises an OptionError
+    if the value is not numeric, or does not fill whole rows.
     """
     try:
         found: np.ndarray = np.asarray(value, kind)
@@ -121,8 +118,7 @@ def whole(name: str, value: Any) -> int:
 
 
 LARGEST = 1e38
-"""Options that must be above 0, or at least 0, may not exceed this, so that they are finite in
-float32."""
+"""`positive` and `not_negative` options may not exceed this, so that they are finite in float32."""
 
 
 def check_ranges(
@@ -170,11 +166,7 @@ def _numbers(value: object) -> list[Any]:
 
 
 def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
-    """Return the entry of this name; `kind` says what the entries are, such as "matcher".
-
-    Raises:
-        OptionError: the name is unknown; the message suggests the nearest known one.
-    """
+    """Return the entry of this name, or raise an OptionError; `kind` is as in `check_name`."""
     check_name(kind, name, registry)
     return registry[name]
 

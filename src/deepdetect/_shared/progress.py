@@ -64,9 +64,9 @@ def progress(total: int | None, title: str, unit: str, quiet: bool = False, done
 def stage_progress(
     title: str, stages: Sequence[str] = (), quiet: bool = False
 ) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar of stages; yield a function to call with a stage's name when it ends.
+    """Show a progress bar of stages; yield a function to call with the name of each ended stage.
 
-    The bar names the running stage or, if `stages` is empty, the last one that ended.
+    The bar names the running stage or, if `stages` is empty, the last ended stage.
     """
     # The bar appears only on a terminal, so that logs stay readable.
     quiet = quiet or not STDERR.isatty()

@@ -24,27 +24,21 @@ from .atomic import atomic_path
 from .errors import DeepDetectError, MissingFileError, OptionError
 
 FOLDER = ".deepdetect"
-"""Folder of the records, inside the folder of the outputs."""
-
 ADVICE = "choose another place with -o, or replace it with --overwrite"
 
 
 def key(*values: Any) -> str:
     """Return a digest of values, 32 hexadecimal digits that are the same on every machine.
 
-    Values may be None, booleans, numbers, text, bytes, lists, tuples, sets and dicts. Arrays count
-    with type, shape and content, paths with the content of their files, and dataclasses with their
-    names and fields.
-
-    Raises:
-        MissingFileError: a file is missing.
+    Values may be JSON values, tuples, sets, bytes, arrays, dataclasses, and paths, which stand for
+    the contents of their files. Raises a MissingFileError if a file is missing.
     """
     text = json.dumps(plain(values), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON restores it, with digests for bytes, arrays and files. See `key`."""
+    """Return a value in the types of JSON, with digests instead of bytes, arrays and files."""
     match value:
         case None | bool() | int() | float() | str():
             return value
@@ -71,11 +65,7 @@ def plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, cached in this process until the file's size or time changes.
-
-    Raises:
-        MissingFileError: the file cannot be read.
-    """
+    """Return a file's SHA-256, cached until the file changes, or raise a MissingFileError."""
     try:
         return _file_digest(path.resolve(), *file_state(path))
     except OSError as error:
@@ -98,12 +88,9 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def check_same(place: Path, before: object, now: Mapping[str, Any], advice: str = ADVICE) -> None:
-    """Check that an existing output was made with the same settings as those of this run.
+    """Raise an OptionError if an existing output has no settings, or other ones than this run.
 
     `before` are the settings of the output, `now` those of this run, both as `plain` returns them.
-
-    Raises:
-        OptionError: settings differ, which the message names, or the output has no settings.
     """
     if not isinstance(before, Mapping):
         raise OptionError(f"{place} exists, written by another program: {advice}")
@@ -142,11 +129,7 @@ class Outputs:
     growing: bool = False
 
     def check(self) -> None:
-        """Check that this work may replace the existing outputs; call it before long work.
-
-        Raises:
-            OptionError: an existing output has other inputs or settings, or no record.
-        """
+        """Raise an OptionError if an existing output has no record, or other inputs or settings."""
         if not self.overwrite:
             for path in self.paths:
                 self._known(path)
@@ -172,7 +155,7 @@ class Outputs:
         """Write the records before and after the block; yield a dictionary for values to note.
 
         If the block fails, outputs that it did not replace get their former records back. If the
-        process is killed, the records already name this work, and call its outputs incomplete.
+        process is killed, the records name this work's inputs, and call its outputs incomplete.
 
         Raises:
             OptionError: `check` fails.
@@ -272,8 +255,7 @@ def was_made(path: Path, root: Path) -> bool:
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Any], *, compress: bool = True) -> None:
     """Write named arrays to an NPZ file, which appears complete or not at all."""
-    # Level 1 compresses coordinates of dense keypoints to 28% of their size. NumPy's level 6 takes
-    # eight times as long, and reaches only 24%.
+    # Level 1 compresses dense keypoints to 28%. Level 6 of NumPy takes 8 times as long, for 24%.
     method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
     with (
         atomic_path(path) as temporary,
@@ -295,12 +277,9 @@ def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
 
 @contextmanager
 def lock(path: Path, final: Path) -> Iterator[None]:
-    """Hold the lock file `path`, so that only one process at a time writes `final`.
+    """Hold the lock file `path` of `final`; raise an OptionError if another process holds it.
 
     On Windows, and in network folders without locks, nothing is locked.
-
-    Raises:
-        OptionError: another process holds the lock.
     """
     try:
         import fcntl

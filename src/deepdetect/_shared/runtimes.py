@@ -18,7 +18,7 @@ _import_lock = threading.Lock()
 
 
 def import_onnxruntime() -> ModuleType:
-    """Import ONNX Runtime with ORT_DISABLE_TELEMETRY=1, unless the user has set it."""
+    """Import ONNX Runtime with ORT_DISABLE_TELEMETRY=1, unless the user has set this variable."""
     # The variable is read during the import; disable_telemetry_events() would come too late.
     variable = "ORT_DISABLE_TELEMETRY"
     return _import_with("onnxruntime", os.environ, variable, os.environ.get(variable, "1"))
@@ -26,7 +26,7 @@ def import_onnxruntime() -> ModuleType:
 
 def import_openvino() -> ModuleType:
     """Import OpenVINO as if the optional openvino_telemetry were not installed."""
-    # Only the variable CI turns its telemetry off. It is not set, as other packages also read it.
+    # The variable CI would also turn OpenVINO's telemetry off, but other packages read it too.
     return _import_with("openvino", sys.modules, "openvino_telemetry", None)
 
 
@@ -36,8 +36,7 @@ def _import_with(
     """Import a package while `entries[key]` has this value; then restore the entry.
 
     ONNX Runtime and OpenVINO start telemetry when they are imported: they write an identifier into
-    the home folder, and OpenVINO sends an event. If the package has been imported before, nothing
-    is changed.
+    the home folder, and OpenVINO sends an event.
     """
     with _import_lock:
         if package in sys.modules:

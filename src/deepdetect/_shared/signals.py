@@ -11,14 +11,14 @@ from contextlib import contextmanager
 from types import FrameType
 
 ENDING = ("SIGTERM", "SIGHUP")
-"""Signals sent by `kill`, and by a terminal that is closed; Windows lacks the second."""
+"""Signals sent by `kill`, and by a terminal that is closed; Windows lacks SIGHUP."""
 
 
 @contextmanager
 def handle_signals(
     handler: Callable[[int, FrameType | None], object], names: Sequence[str] = ENDING
 ) -> Iterator[None]:
-    """Handle signals by `handler` while the block runs; in other than the main thread, do nothing.
+    """Handle signals by `handler` while the block runs; outside the main thread, do nothing.
 
     Signals that are ignored, as by `nohup`, stay ignored. A handler that the program has set stays,
     except the one for Ctrl-C.
@@ -37,7 +37,7 @@ def handle_signals(
 
 
 def exit_by_signal(number: int, frame: FrameType | None) -> None:
-    """End the program with the exit code that shells give; a handler for `handle_signals`."""
+    """Exit with 128 plus the signal's number, as shells do; a handler for `handle_signals`."""
     raise SystemExit(128 + number)
 
 
@@ -45,7 +45,7 @@ def exit_by_signal(number: int, frame: FrameType | None) -> None:
 def noted_interrupts() -> Iterator[list[int]]:
     """Yield a list that gets an entry at each Ctrl-C, which still raises KeyboardInterrupt.
 
-    The list is needed because an interrupted import may raise another error instead.
+    The list is needed because an interrupted import may raise another error instead of that one.
     """
     noted: list[int] = []
 
@@ -69,7 +69,7 @@ def endings_interrupt() -> Iterator[None]:
 
 @contextmanager
 def sigterm_kept() -> Iterator[None]:
-    """Restore the handler of SIGTERM after the block, because native code in it may change it."""
+    """Restore the handler of SIGTERM after the block, because native code there may replace it."""
     handler = signal.getsignal(signal.SIGTERM)
     yield
     if handler is not None and threading.current_thread() is threading.main_thread():
@@ -80,14 +80,14 @@ def sigterm_kept() -> Iterator[None]:
 def signals_held() -> Iterator[None]:
     """Defer Ctrl-C while the block runs.
 
-    Processes that are started in the block defer it until they call `end_worker_by_signals`.
+    Processes started in the block defer Ctrl-C until they call `end_worker_by_signals`.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     from multiprocessing import resource_tracker
 
-    # Starting multiprocessing's resource tracker unblocks Ctrl-C, so it is started before.
+    # Starting multiprocessing's resource tracker unblocks Ctrl-C, so it is started first.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
@@ -117,7 +117,7 @@ def end_worker_by_signals() -> None:
 
 
 def kill_group(process: int = 0) -> None:
-    """Kill all processes in the group of a process, by default this one's; not on Windows."""
+    """Kill the process group of a process, by default of this one; on Windows, do nothing."""
     if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process, signal.SIGKILL)

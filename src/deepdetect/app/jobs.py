@@ -1,4 +1,4 @@
-"""Running tasks: each has a process and a folder, which are removed if the page stops asking."""
+"""Running tasks: each has a process and a folder until the page stops sending requests for it."""
 
 from __future__ import annotations
 
@@ -69,9 +69,9 @@ class Job:
     """A task and its process.
 
     Attributes:
-        name: secret name that only the page knows.
+        name: secret name of the task, which only the page knows.
         state: what is sent to the page: the progress, the result or an error.
-        started, asked: times of the task's start, and of the last request from the page.
+        started, asked: times of the start, and of the page's last request for this task.
     """
 
     def __init__(self, order: Order) -> None:
@@ -98,7 +98,7 @@ class Job:
         self._reason = reason
         if self.process.pid is not None:
             kill_group(self.process.pid)
-        self.process.kill()  # needed on Windows, and before it has made its group
+        self.process.kill()  # needed on Windows, and before the process has made its group
         self._listener.join()
 
     def _listen(self) -> None:
@@ -149,7 +149,7 @@ class Jobs:
             shutil.rmtree(job.folder, ignore_errors=True)
 
     def end_overdue(self) -> None:
-        """End tasks that take too long, and remove those that the page no longer asks for."""
+        """End tasks that take too long; remove tasks for which the page sends no more requests."""
         now = time.monotonic()
         for job in list(self._jobs.values()):
             if now - job.asked > self.limits.abandoned_s:

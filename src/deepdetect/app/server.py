@@ -1,7 +1,7 @@
 """Server of the page: for one user, only on the loopback address, without permanent storage.
 
-Starlette and uvicorn handle HTTP. The server rejects requests that name another host, come from
-another page, lack the secret key, which is new at each start, or are too large.
+Starlette and uvicorn handle HTTP. The server rejects requests that are too large, name another
+host, come from another page, or lack the secret key. The key is new at each start.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ CHECK_EVERY_S = 1.0
 """Interval in seconds at which the server ends tasks that take too long or are abandoned."""
 
 MAX_IMAGE_PIXELS = 2_100_000
-"""Maximum number of pixels of an image that the page sends. It exceeds two megapixels, because the
-page scales images to that size, but then rounds their sides to multiples of 8."""
+"""Maximum number of pixels of an image that the page sends. The page scales images to two
+megapixels, but then rounds their sides to multiples of 8, which may enlarge them slightly."""
 
 POINT_BYTES = 12
 MAX_POINTS = 4000
@@ -89,8 +89,8 @@ VIEWER_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "frame-ancestors 'self'; sandbox allow-scripts allow-downloads"
 )
-"""Content security policy for the viewer of a 3D model. The viewer is one HTML file with an inline
-script, and the policy isolates it from the page around it."""
+"""Content security policy for the viewer of a 3D model. The viewer is an HTML file with an inline
+script, which the policy isolates from the page around the viewer."""
 
 
 class AppServer:
@@ -157,7 +157,7 @@ class AppServer:
         self._server.should_exit = True
 
     def _routes(self) -> Starlette:
-        # The system's table may have a wrong type for .js, because programs on Windows change it.
+        # Programs on Windows may have changed the type of .js files in the system's table.
         mimetypes.add_type("text/javascript", ".js")
         return Starlette(
             routes=[
@@ -269,8 +269,8 @@ class AppServer:
     async def _descriptors(self, request: Request) -> Response:
         """Receive an image and points; send learned descriptors of the points at angle 0.
 
-        The image is (H, W) uint8 grey values. The points are float32: (N, 2) positions, followed
-        by (N,) sizes. The descriptors are (N, 64).
+        The image is (H, W) uint8. The points are (N, 2) positions, then (N,) sizes, in float32. The
+        descriptors are (N, 64) float32.
         """
 
         def described(gray: np.ndarray, numbers: bytes) -> np.ndarray:
@@ -316,7 +316,7 @@ class AppServer:
         return Response(await run_in_threadpool(answer), media_type="application/octet-stream")
 
     async def _new_job(self, request: Request) -> Response:
-        """Start a task. The request has a length, JSON text of this length, and the image files."""
+        """Start a task. The body is the length of a JSON text in 4 bytes, the text, and images."""
         self._check_key(request)
         kind, options = request.query_params.get("kind", ""), self.options
         if kind not in TASKS:

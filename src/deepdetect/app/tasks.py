@@ -1,4 +1,4 @@
-"""Tasks that the page can run in Python: one function and one line of `TASKS` each.
+"""Tasks that the page can run in Python: one function and one entry of `TASKS` each.
 
 A task reads images, reports its progress, writes files, and returns what the page shows.
 """
@@ -34,7 +34,7 @@ MODEL_STAGES = 9
 """Maximum number of progress stages of a 3D model, including the writing of its files."""
 
 ASSUMED_FOCAL = 1.2
-"""Focal length assumed for images without EXIF, as a multiple of the longer side, as in COLMAP."""
+"""Focal length assumed for images without EXIF, in units of the longer side, as in COLMAP."""
 
 Report = Callable[[str, int, int], None]
 """Function called when a stage begins, with its name, the number of stages done, and the number
@@ -67,7 +67,7 @@ class Order:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Result of a task: `numbers` as text by label, the file to show, and the files to download."""
+    """Result of a task: `numbers` maps labels to texts, and `files` can be downloaded."""
 
     numbers: Mapping[str, str]
     shown: str
@@ -80,8 +80,8 @@ class Task:
 
     `files` are the smallest and the largest number of images; None stands for the server's limit.
     `packages` are packages that the task needs and that are not installed with DeepDetect.
-    `options` maps names of numeric options to their labels on the page. With `folder`, the page
-    offers the task for whole folders instead of a few chosen images.
+    `options` maps names of numeric options to their labels on the page. If `folder` is set, the
+    page offers the task for whole folders, otherwise for single images.
     """
 
     title: str
@@ -261,7 +261,7 @@ def run_folder_keypoints(
 
 
 def _entry_name(name: str, others: Sequence[str]) -> str:
-    """Return a name for an image's table in the archive: without folders, and not in `others`.
+    """Return a name for an image's CSV file in a ZIP file: without folders, and not in `others`.
 
     Example:
         >>> _entry_name("a/b.jpg", []), _entry_name("../b", ["b.csv"])
@@ -274,9 +274,9 @@ def _entry_name(name: str, others: Sequence[str]) -> str:
 
 
 def _stages(names: Sequence[str], report: Report) -> Callable[[str], None]:
-    """Report the first stage; return a function to call at the end of each.
+    """Report the first stage; return a function to call whenever a stage ends.
 
-    A last stage "files" is added, in which the results are written.
+    A last stage, "files", is added for the writing of the results.
     """
     all_names, done = [*names, "files"], itertools.count()
 

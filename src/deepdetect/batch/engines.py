@@ -1,9 +1,8 @@
 """Engines that run the tasks of a collection: processes of this machine, or a Ray cluster.
 
 To add an engine, write a function with the signature of `map_in_processes` and add it to `ENGINES`.
-Ray restarts a worker that dies, and repeats its tasks. Each outcome arrives once, but the function
-may have run twice for a task. It must therefore write each file under a temporary name, and rename
-the complete file.
+Ray repeats the tasks of a worker that dies, so the function may run twice for a task. The function
+must therefore write each file under a temporary name, and rename the complete file.
 """
 
 from __future__ import annotations
@@ -29,17 +28,14 @@ from .._shared.machine import (
 )
 
 MAX_BLOCKS = 4096
-"""The tasks are divided into at most this number of parts, because scheduling a part costs Ray
-milliseconds. If a worker dies, its whole part is repeated."""
+"""Tasks are divided into at most this many parts, because a part costs Ray some milliseconds."""
 
 PROCESSORS_PER_WORKER = 0.5
-"""Each worker reserves only this fraction of a processor in Ray, though it uses a whole one. If
-half of the machines are lost, the others can therefore take over all workers. Otherwise tasks would
-wait forever for a lost worker."""
+"""Each worker reserves only this fraction of a processor in Ray. If half of the machines are lost,
+the others can therefore take over all workers, for which tasks would otherwise wait forever."""
 
 OBJECT_STORE_BYTES = 200_000_000
-"""Shared memory of a cluster that this module starts. It can be small, because results are written
-to files."""
+"""Shared memory of a cluster that this module starts: little, because results go to files."""
 
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -58,8 +54,8 @@ def map_on_ray(
     The cluster is the one to which this process is connected, or else the one that RAY_ADDRESS
     names, or else one that runs on this machine (`ray start`). Without any, or with
     RAY_ADDRESS=local, a cluster is started for the duration of the work. All machines of the
-    cluster need this package, and the files under the same paths. A DeepDetectError was raised by
-    the function, or says that the cluster failed.
+    cluster need this package, and the files under the same paths. Raises a DeepDetectError if the
+    cluster fails, or if the function raises one.
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")

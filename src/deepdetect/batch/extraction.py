@@ -1,6 +1,6 @@
 """Extraction of the features of all images below a folder, into a file in hloc's layout.
 
-See https://github.com/cvg/Hierarchical-Localization; its pixel coordinates are DeepDetect's.
+hloc (https://github.com/cvg/Hierarchical-Localization) has the pixel coordinates of DeepDetect.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def extract_features(
     Each image has a group, named by its path below the folder, such as "db/1.jpg". It contains:
 
     - `keypoints` (N, 2) float32: x right and y down in pixels, with the centre of the first pixel
-      at (0, 0). The attribute `uncertainty` is their uncertainty in pixels.
+      at (0, 0). Their attribute `uncertainty` is the uncertainty of a position in pixels.
     - `descriptors` (D, N) float32 of unit length: D is 64 for learned descriptors and 128 for
       RootSIFT, which the keypoints of a `DeepDetect` always get.
     - `scores` (N,) float32: higher is better.
@@ -148,7 +148,7 @@ def _extract(
                 keypoints = detector.describe(rgb, keypoints)
             else:
                 keypoints = describe_keypoints(gray, keypoints)
-            # The uncertainty is a pixel of the scaled image in which the keypoints were found.
+            # The uncertainty is one pixel of the scaled image in which the keypoints were found.
             seen = seen_size(gray.shape, HeatmapOptions(detector.settings["resolution"]))
             uncertainty = max(gray.shape[1] / seen[0], gray.shape[0] / seen[1])
             column, row = np.rint(keypoints.xy).astype(np.int64).T
@@ -183,8 +183,8 @@ def feature_group(
 def read_keypoints(file: Any, name: str) -> Keypoints:
     """Return the keypoints of the image `name` in an HDF5 file.
 
-    RootSIFT descriptors become bytes again. Files of other programs do not tell the type of their
-    descriptors, so it stays unknown. Raises an InvalidFileError for damaged keypoints.
+    RootSIFT descriptors become bytes again. If another program wrote the file, the type of the
+    descriptors is unknown. Raises an InvalidFileError for damaged keypoints.
     """
     try:
         settings = json.loads(file.attrs.get(SETTINGS, "{}"))

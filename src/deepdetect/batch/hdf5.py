@@ -38,22 +38,19 @@ from .._shared.records import check_same, key, lock, plain
 from .engines import ENGINES
 
 SETTINGS = "deepdetect"
-"""Name of the attribute of a file with the settings that its content depends on, as JSON."""
+"""Name of the file attribute that stores, as JSON, the settings with which the file was made."""
 
 STATE = "source_state"
-"""Name of the attribute of a group with the state of its input."""
+"""Name of the group attribute that stores the state of the group's input."""
 
 FORMAT = ("v110", "v110")
-"""Oldest and newest file format to write: HDF5 1.10 (2016) and later can read the files, and groups
-with a million members stay fast."""
+"""Oldest and newest file format to write: in that of HDF5 1.10 (2016), large groups are fast."""
 
 MIN_SHARDS = 256
-"""The inputs are divided into at least this number of shards if there are that many inputs, so that
-all workers have something to do. Chosen by hand."""
+"""Minimum number of shards, if there are enough inputs, to keep workers busy. Chosen by hand."""
 
 LARGEST_SHARD = 32
-"""A shard has at most this number of inputs, because a killed worker loses its work on them.
-Smaller shards would mean more files. Chosen by hand."""
+"""Maximum number of inputs of a shard, because a killed worker loses its shard. Chosen by hand."""
 
 State = tuple[int, ...]
 """State of an input: whole numbers that change if the input changes, such as size and time."""
@@ -73,8 +70,8 @@ class Group:
 
 
 MakeGroups = Callable[[Sequence[Item], dict[Any, int], list[str]], Iterator[Group]]
-"""Function that yields the groups made from inputs. For each input, it adds a count to its second
-argument or a failure to its third."""
+"""Function that yields the groups made from inputs. For each input, the function adds a count to
+its second argument or a failure to its third argument."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +80,7 @@ class BatchReport:
 
     Attributes:
         path: the file.
-        counts: number of keypoints of each image, or of matches of each pair, processed by this
-            run.
+        counts: number of keypoints of each image, or of matches of each pair, in this run.
         skipped: number of images or pairs that an earlier run had processed.
         failures: a sentence on each image or pair that could not be processed.
         of: "images" or "pairs".
@@ -123,8 +119,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     if not path.is_file():
         raise MissingFileError(f"there is no file {path}: check the path")
     try:
-        # No process writes to a file under its final name, so no lock is needed. Network folders
-        # may lack locks.
+        # No process writes to a complete file. Locks are not needed; some networks lack them.
         file = h5py.File(path, "r", locking=False)
     except OSError as error:
         raise DeepDetectError(
@@ -199,14 +194,14 @@ def fill_file(
 ) -> BatchReport:
     """Make the wanted groups that are not in the file yet, in the processes of an engine.
 
-    An existing file must have the same `settings`. Shards that an interrupted run has left are used
-    if they have the same settings. `wanted` maps each input to the groups that can serve it, each
-    with the state of the input: if none of them is in the file with this state, the first one is
-    made. `others_stay` says of any other group, or a group whose input fails, whether it stays.
+    An existing file must have the same `settings`. Shards of an interrupted run with the same
+    settings are used. `wanted` maps each input to its possible groups, and each of these to the
+    state of the input. If no possible group is in the file with its state, the first one is made.
+    Other groups, and groups whose input fails, stay only if `others_stay` is true for their names.
     """
     import_h5py()
     map_tasks, work = look_up("engine", engine, ENGINES), partial(_write_shard, make=make)
-    list(map_tasks(work, [], workers))  # raises an error before the work if the engine is missing
+    list(map_tasks(work, [], workers))  # raises an error early if the engine is missing
     target, settings = Path(path).absolute(), plain(settings)
     if target.is_dir():
         raise OptionError(f"{target} is a folder: give a file in it with -o")
@@ -262,7 +257,7 @@ def fill_file(
                         bar.update(1)
                     for name in filter(merged.__contains__, gone):
                         del merged[name]
-        with contextlib.suppress(OSError):  # the next run merges shards that remain, without effect
+        with contextlib.suppress(OSError):  # shards that remain do no harm to the next run
             shutil.rmtree(folder)
     return BatchReport(Path(path), dict(sorted(counts.items())), skipped, (*sorted(failures),), of)
 
@@ -274,7 +269,7 @@ def _shard_files(folder: Path) -> list[Path]:
 
 
 def _divided(items: Sequence[Item], folder: Path) -> list[tuple[Path, Sequence[Item]]]:
-    """Divide inputs into shards; return the file of each, whose name depends on its input names."""
+    """Divide inputs into shards; name each shard's file by a digest of the names of its inputs."""
     size = min(LARGEST_SHARD, max(1, len(items) // MIN_SHARDS))
     parts = [items[k : k + size] for k in range(0, len(items), size)]
     return [(folder / f"{key([name for name, _ in part])}.h5", part) for part in parts]

@@ -56,8 +56,7 @@ def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
 
 
 SIMILAR = 20
-"""The choice "similar", without a number, matches each image with this many others. Chosen by
-hand."""
+"""The choice "similar" matches each image with this many others. Chosen by hand."""
 
 
 def similar(pairs: object) -> int | None:
@@ -89,10 +88,7 @@ def list_pairs(pairs: str | Path | Sequence[Sequence[str]], names: Sequence[str]
 
 
 def check_pairs(pairs: Sequence[Sequence[str]], place: str = "`pairs`") -> list[Pair]:
-    """Return pairs; leave out those that repeat an earlier one, in the same or the other order.
-
-    Raises an OptionError for a wrong pair.
-    """
+    """Return pairs without repetitions in either order; raise an OptionError for a wrong pair."""
     kept: dict[Pair, None] = {}
     for pair in pairs:
         if isinstance(pair, str) or len(pair) != 2 or pair[0] == pair[1] or not all(pair):

@@ -172,7 +172,7 @@ def match_pairs(
 
 
 def first_keypoints(features: Path) -> Keypoints | None:
-    """Return the first undamaged keypoints in a file; those of all images are of one kind."""
+    """Return the first undamaged keypoints in a file, or None; all keypoints are of one kind."""
     with open_hdf5(features) as file:
         for name in feature_names(file):
             with suppress(InvalidFileError):
@@ -185,10 +185,9 @@ def _find_pairs(
 ) -> tuple[dict[Pair, dict[str, State]], list[str], set[str], str]:
     """Find out which pairs can be matched with the features in a file.
 
-    Returns, first, the two groups in which the matches of such a pair may be stored, each with the
-    states of the pair's features; second, a sentence on each pair that cannot be matched; third,
-    the groups of pairs without features, whose matches are obsolete; last, a digest of the settings
-    of the features.
+    Returns, for each such pair, the two groups that may store its matches, with the states of its
+    features; a sentence on each other pair; the groups of pairs without features, which are
+    obsolete; and a digest of the settings of the features.
     """
     wanted: dict[Pair, dict[str, State]] = {}
     failures: list[str] = []
@@ -256,8 +255,8 @@ def match_group(
 ) -> Group:
     """Return the group of a pair's matches in hloc's layout.
 
-    `rows` (K, 2) are the indices of matching keypoints in the first and second image, `scores` (K,)
-    their scores, and `count` is the number of keypoints of the first image.
+    `count` is the number of keypoints of the first image. `rows` (K, 2) are the indices of matching
+    keypoints in the first and second image, and `scores` (K,) are the scores of the matches.
     """
     matches0, scores0 = np.full(count, -1, np.int32), np.zeros(count, np.float32)
     matches0[rows[:, 0]], scores0[rows[:, 0]] = rows[:, 1], scores

@@ -25,17 +25,15 @@ COMPARED_KEYPOINTS = 512
 """An image is described by at most this number of its best keypoints. Chosen by hand."""
 
 WORDS, DESCRIPTORS_OF_WORD = 64, 8
-"""The vocabulary has `WORDS` words. It has fewer if there are fewer than `DESCRIPTORS_OF_WORD`
-training descriptors per word. Chosen by hand."""
+"""The vocabulary has `WORDS` words, or fewer, so that each has at least `DESCRIPTORS_OF_WORD`
+training descriptors on average. Chosen by hand."""
 
 KMEANS_ITERATIONS = 10
 TRAINING_IMAGES, TRAINING_DESCRIPTORS = 500, 50_000
-"""The vocabulary is trained on at most these total numbers of images and descriptors, to save
-time."""
+"""To save time, the vocabulary is trained on at most these numbers of images and descriptors."""
 
 COMPARED_ROWS = 256
-"""The vectors of this many images are compared at once with those of all images, which takes 300 MB
-of memory for a collection of 100,000 images."""
+"""This many images are compared at once with all others, which takes 300 MB for 100,000 images."""
 
 
 def similar_pairs(
@@ -87,7 +85,7 @@ def vlad_vectors(
     """Describe each image by a VLAD vector, in which each word's sum of residuals has unit length.
 
     `descriptors(i)` returns the descriptors of image i, (N_i, D) float32 of unit length. Returns
-    (M, words * D) vectors of unit length, and the (M,) indices of their images. Images without
+    (M, words * D) vectors of unit length, and the (M,) indices of the images. Images without
     descriptors, or with another D than most images, are left out.
     """
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
 """Drop-in replacements for parts of OpenCV, kornia, LightGlue and hloc.
 
-Each program has its own module, which can only be imported if that program is installed.
+Importing a module raises a MissingExtraError if a package that it needs is not installed.
 """

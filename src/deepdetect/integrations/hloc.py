@@ -62,9 +62,9 @@ class DeepDetectExtractor(BaseModel):
     """Extractor of the best keypoints of all scales and descriptors, for `hloc.extract_features`.
 
     The options `max_keypoints`, `spread` and `descriptor` are those of `PointDetector`; hloc's
-    LightGlue needs the descriptor "rootsift". `angle_unit` is the unit of `oris`: "degrees" as in
+    LightGlue needs the descriptor "rootsift". `angle_unit` is the unit of angles: "degrees" as in
     hloc's own SIFT, or "radians" as LightGlue needs. Positions are float64, because hloc rounds
-    float32 to half precision.
+    float32 positions to half precision.
     """
 
     default_conf: dict[str, Any] = {  # noqa: RUF012  # hloc's way to declare it
@@ -105,10 +105,10 @@ class DeepDetectExtractor(BaseModel):
 class DeepDetectMatcher(BaseModel):
     """Nearest-neighbour matcher with the ratio test, for `hloc.match_features`.
 
-    The options `ratio` and `mutual` are those of `match_features`. It matches the features of any
-    extractor whose descriptors are compared by Euclidean distance. If `descriptor` is "learned",
-    the features must be those of `DeepDetectExtractor` with `oris` in degrees. The matcher then
-    finds more matches, because it takes the rotation between the images into account.
+    The options `ratio` and `mutual` are those of `match_features`. The matcher accepts descriptors
+    of any extractor, if they are compared by Euclidean distance. If `descriptor` is "learned", the
+    features must be those of `DeepDetectExtractor` with angles in degrees. The matcher then finds
+    more matches, because it takes the rotation between the images into account.
     """
 
     default_conf: dict[str, Any] = {  # noqa: RUF012
@@ -186,12 +186,7 @@ class DeepDetectDenseMatcher(BaseModel):
 
 
 def register() -> None:
-    """Register the extractor, the matcher and the dense matcher with hloc.
-
-    Call it once in the program that calls hloc. Then `{"name": "deepdetect"}` is an extractor of
-    `hloc.extract_features` and a matcher of `hloc.match_features`, and `{"name":
-    "deepdetect_dense"}` is a matcher of `hloc.match_dense`.
-    """
+    """Register the models with hloc; call this once in the program that calls hloc."""
     models = (
         (hloc.extractors, NAME, DeepDetectExtractor),
         (hloc.matchers, NAME, DeepDetectMatcher),

@@ -24,7 +24,7 @@ Scale = Literal["diameter", "sigma"]
 
 MAX_KEYPOINTS = 4096
 """Maximum number of keypoints, as in LightGlue's own SIFT extractor, because LightGlue's time and
-memory grow with the square of it."""
+memory grow with the square of the number."""
 
 
 class DeepDetectExtractor(Module):
@@ -32,7 +32,7 @@ class DeepDetectExtractor(Module):
 
     Args:
         detector: detector of at most 4,096 points with RootSIFT, for which LightGlue has weights.
-        scale: meaning of "scales", "diameter" or "sigma", as in `Keypoints.to_lightglue`.
+        scale: what the tensor "scales" holds, "diameter" or "sigma"; see `Keypoints.to_lightglue`.
 
     Raises:
         OptionError: an option is unknown or out of its range.

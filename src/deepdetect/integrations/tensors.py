@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     import torch
 
 OVERSHOOT = 0.25
-"""The values of a tensor may lie outside [0, 1] by at most this, because bicubic filters overshoot.
-They are clipped."""
+"""Tensor values up to this far outside [0, 1] are clipped, because bicubic filters overshoot."""
 
 
 def load_tensor(image: Any) -> np.ndarray:

@@ -131,10 +131,7 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def check_upright(paths: Iterable[Path]) -> None:
-    """Raise an OptionError for images that EXIF rotates, because hloc ignores EXIF.
-
-    Images that cannot be read are not checked.
-    """
+    """Raise an OptionError for a readable image that EXIF rotates, because hloc ignores EXIF."""
     for path in paths:
         try:
             with open_image(path) as image:

@@ -23,7 +23,7 @@ from .collection import Collection, check_names
 
 MATCHES_NAME = "matches"
 DEFAULT_SIZE_PX = 3.0
-"""Keypoints without a size get this diameter, with which dense keypoints are described."""
+"""Keypoints without a size get this diameter in pixels, as if a dense keypoint were described."""
 
 
 @suggest_keywords

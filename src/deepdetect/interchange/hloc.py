@@ -1,7 +1,6 @@
 """Files of hloc: features, matches and pairs, in float32 and int32.
 
-hloc's pixel coordinates are the same as DeepDetect's. hloc itself adds the half pixel by which
-those of COLMAP differ.
+hloc uses the pixel coordinates of DeepDetect. It adds half a pixel itself to those for COLMAP.
 """
 
 from __future__ import annotations

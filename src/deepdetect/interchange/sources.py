@@ -25,7 +25,7 @@ MAX_ALL_PAIRS = 50
 """If no pairs are given, all pairs of at most this number of images are matched. Chosen by hand."""
 
 MATCHES_SUFFIX = "_matches"
-"""The names of NPZ files written by `deepdetect match` end with this, before the suffix."""
+"""The names of NPZ files written by `deepdetect match` end with this, before the suffix .npz."""
 
 
 @suggest_keywords
@@ -41,12 +41,11 @@ def read_collection(
         files: one HDF5 file written by `deepdetect extract` or hloc; or npz files written by
             `deepdetect detect` (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz).
         matches: HDF5 file written by `deepdetect match-many` or hloc.
-        images: folder of the images. It also serves to find the images that npz files name only by
-            their stems.
+        images: folder of the images, in which images that npz files name by stems are looked up.
 
     Returns:
-        The collection. It takes from npz files only the matches that are inliers of the geometry.
-        They join keypoints, not refined positions, so that matches of several pairs form tracks.
+        The collection. Matches from npz files are only the inliers of the geometry, and join
+        keypoints, not refined positions, so that matches of several pairs form tracks.
 
     Raises:
         DeepDetectError: a file is missing or of another kind, or the names of images do not agree.
@@ -169,8 +168,8 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
 def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
     """Map the names that an npz file may use for an image to the image's name.
 
-    They are its path below the folder with or without suffix, and its stem. Those that fit several
-    images are left out. Returns None without a folder.
+    These names are the image's path below the folder, with or without suffix, and its stem. Names
+    that fit several images are left out. Without a folder, the result is None.
     """
     if folder is None:
         return None
@@ -183,7 +182,7 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
 
 
 def _name_of(path: Path, names: Mapping[str, str]) -> str:
-    """Return the image name that belongs to the longest known end of an npz file's path."""
+    """Return the image name of the longest end of an npz file's path that is a key of `names`."""
     parts = path.with_suffix("").parts
     for first in range(len(parts)):
         if (key := "/".join(parts[first:])) in names:

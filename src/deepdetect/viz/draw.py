@@ -10,8 +10,7 @@ import numpy as np
 from .._shared.opencv import cv2
 
 MAX_CIRCLES = 5000
-"""If there are more keypoints than this, they are drawn as single pixels, because circles would
-cover the image."""
+"""More keypoints than this are drawn as single pixels, because circles would cover the image."""
 
 LEAST_RADIUS_PX = 2.0
 """Minimum radius of a keypoint's circle, in pixels. Keypoints without a size get a radius one pixel
@@ -28,8 +27,7 @@ LINES, DOTS = 60, 1500
 `LINES` of the pairs are joined by a line. Chosen by hand."""
 
 SHOWN_PERCENTILE = 99.0
-"""Colour scales end at this percentile of the values, and begin at 100 minus it (the 1st), so that
-outliers do not stretch them."""
+"""Colour scales end at this percentile, and begin at the 1st, so that outliers do not matter."""
 
 LEAST_DEPTH_LEVEL = 0.2
 """The farthest depth has this level (0 to 1) of the colour scale, because darker colours look like
@@ -48,7 +46,7 @@ GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
 
 def draw_keypoints(rgb: np.ndarray, xy: np.ndarray, sizes: np.ndarray | None) -> np.ndarray:
-    """Draw keypoints on a dimmed copy of a (H, W, 3) uint8 RGB image, for `Keypoints.draw`."""
+    """Draw keypoints on a dimmed copy of an (H, W, 3) uint8 RGB image, for `Keypoints.draw`."""
     canvas, unit = rgb // 2, line_scale(rgb)
     if len(xy) > MAX_CIRCLES:
         # Half transparent, so that the image stays visible below dense keypoints.
@@ -129,13 +127,13 @@ def draw_circle(
 
 
 def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
-    """Colour a (H, W) probability map as (H, W, 3) uint8 RGB: dark blue is 0, yellow is 1."""
+    """Colour an (H, W) probability map as (H, W, 3) uint8 RGB: dark blue is 0, yellow is 1."""
     levels = np.rint(np.clip(heatmap, 0, 1) * 255).astype(np.uint8)
     return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
 
 
 def draw_logits(logits: np.ndarray) -> np.ndarray:
-    """Colour a (H, W) map of logits, with a colour scale below it.
+    """Colour an (H, W) map of logits, with a colour scale below it.
 
     A logit of 0 is a probability of 0.5. A map of probabilities would saturate, because float32
     rounds the probability of a sixth of the pixels of a photograph to 1.
@@ -150,9 +148,9 @@ def draw_logits(logits: np.ndarray) -> np.ndarray:
 
 
 def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
-    """Colour a (H, W) depth map, with a colour scale below it, and reduce it by `fit_picture`.
+    """Colour an (H, W) depth map, with a colour scale below it, and reduce it by `fit_picture`.
 
-    Yellow is near, dark blue is far. Depth is unknown where it is NaN, which is drawn black.
+    Yellow is near, dark blue is far. Unknown depth, given as NaN, is black.
     """
     known = np.isfinite(depth)
     if not known.any():
@@ -182,7 +180,7 @@ def viridis(levels: np.ndarray) -> np.ndarray:
 
 
 def line_scale(picture: np.ndarray) -> float:
-    """Return the factor that enlarges captions, lines and points on an image of this width."""
+    """Return the factor by which captions, lines and points are enlarged on this image."""
     return max(1.0, picture.shape[1] / READABLE_WIDTH_PX)
 
 
@@ -224,7 +222,7 @@ def add_scale(
 
 
 def _caption(text: str, width: int, unit: float) -> np.ndarray:
-    """Return a black strip with a line of text that fits its width; `line_scale` returns `unit`."""
+    """Return a black strip with a line of text that fits its width; `unit` is from `line_scale`."""
     strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
     room = width - round(2 * CAPTION_MARGIN * unit)
     if room <= 0:
