@@ -106,7 +106,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
 
 
 def check_name(kind: str, name: object, known: Collection[object]) -> None:
-    """Raise an OptionError if a name is unknown; `kind` is the kind of names, such as "option"."""
+    """Raise an OptionError for an unknown name; `kind` says what is named, such as "projection"."""
     if name not in known:
         raise unknown_name(kind, name, map(str, known))
 

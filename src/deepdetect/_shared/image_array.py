@@ -30,7 +30,7 @@ def as_array(image: Any) -> np.ndarray:
     """Return an array-like, or a PyTorch tensor on any device, as a NumPy array.
 
     Raises:
-        ImageError: the value is None, an iterator, a sparse or meta tensor, or of ragged rows.
+        ImageError: the value is None, an iterator, a sparse or meta tensor, or has ragged rows.
     """
     if image is None:
         raise ImageError("the image is None, as `cv2.imread` returns for a missing file: check it")

@@ -37,7 +37,7 @@ TASKS_PER_WORKER = 8
 """`map_in_processes` queues this many tasks per worker, so that no worker idles. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""If the work is interrupted or fails, workers that still run are killed after these seconds."""
+"""If the work is interrupted or fails, running workers are killed after this many seconds."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that set the number of threads of libraries when they are loaded."""
@@ -205,7 +205,7 @@ def thread_limit() -> int | None:
     """
     if chosen := getattr(_chosen, "threads", None):
         return int(chosen)
-    # multiprocessing is not imported here, because its child processes have imported it before.
+    # multiprocessing is not imported for this: its own child processes have imported it already.
     parent_of = getattr(sys.modules.get("multiprocessing.process"), "parent_process", None)
     wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     if _max_threads is None and wished.isdecimal() and int(wished):
@@ -282,7 +282,7 @@ def require_memory(what: str, advice: str, **counts: float) -> None:
 def disable_malloc_trim() -> None:
     """Let this process keep the memory that it frees, if the C library is glibc.
 
-    By default, glibc returns large freed blocks to the system, which clears the pages of new ones.
+    By default, glibc returns large freed blocks to the system, which clears pages of new blocks.
     Clearing takes a fifth of the time of a training step on the CPU.
     """
     if platform.libc_ver()[0] == "glibc":

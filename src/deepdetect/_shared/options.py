@@ -71,7 +71,7 @@ ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     Callable: (Callable,),
     Mapping: (Mapping,),
 }
-"""For each type in an annotation, the types of the values that are accepted."""
+"""Types of the values that are accepted, by the type in the annotation."""
 MADE_LATER = type(functools.cache(len))
 """Type of functions decorated with `functools.cache`. An argument may be such a function instead of
 an object, for example keypoints; the function makes the object at the first use."""
@@ -166,7 +166,10 @@ def _numbers(value: object) -> list[Any]:
 
 
 def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
-    """Return the entry of this name, or raise an OptionError; `kind` is as in `check_name`."""
+    """Return the entry of this name; `kind` says what the entries are, such as "matcher".
+
+    Raises an OptionError if the name is unknown.
+    """
     check_name(kind, name, registry)
     return registry[name]
 

@@ -67,7 +67,7 @@ class Order:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Result of a task: `numbers` maps labels to texts, and `files` can be downloaded."""
+    """Result of a task: texts by label (`numbers`), the file to show, the files to download."""
 
     numbers: Mapping[str, str]
     shown: str
@@ -81,7 +81,7 @@ class Task:
     `files` are the smallest and the largest number of images; None stands for the server's limit.
     `packages` are packages that the task needs and that are not installed with DeepDetect.
     `options` maps names of numeric options to their labels on the page. If `folder` is set, the
-    page offers the task for whole folders, otherwise for single images.
+    page offers the task for whole folders, otherwise for chosen images.
     """
 
     title: str

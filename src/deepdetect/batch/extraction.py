@@ -1,6 +1,6 @@
 """Extraction of the features of all images below a folder, into a file in hloc's layout.
 
-hloc (https://github.com/cvg/Hierarchical-Localization) has the pixel coordinates of DeepDetect.
+hloc (https://github.com/cvg/Hierarchical-Localization) uses the pixel coordinates of DeepDetect.
 """
 
 from __future__ import annotations

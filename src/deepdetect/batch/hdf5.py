@@ -44,7 +44,7 @@ STATE = "source_state"
 """Name of the group attribute that stores the state of the group's input."""
 
 FORMAT = ("v110", "v110")
-"""Oldest and newest file format to write: in that of HDF5 1.10 (2016), large groups are fast."""
+"""Oldest and newest file format to write: HDF5 1.10 (2016), in which large groups are fast."""
 
 MIN_SHARDS = 256
 """Minimum number of shards, if there are enough inputs, to keep workers busy. Chosen by hand."""
@@ -119,7 +119,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     if not path.is_file():
         raise MissingFileError(f"there is no file {path}: check the path")
     try:
-        # No process writes to a complete file. Locks are not needed; some networks lack them.
+        # A complete file is never written to, so it needs no lock; network folders may lack locks.
         file = h5py.File(path, "r", locking=False)
     except OSError as error:
         raise DeepDetectError(
@@ -195,9 +195,10 @@ def fill_file(
     """Make the wanted groups that are not in the file yet, in the processes of an engine.
 
     An existing file must have the same `settings`. Shards of an interrupted run with the same
-    settings are used. `wanted` maps each input to its possible groups, and each of these to the
-    state of the input. If no possible group is in the file with its state, the first one is made.
-    Other groups, and groups whose input fails, stay only if `others_stay` is true for their names.
+    settings are used. `wanted` maps each input to the groups that may hold its result, and each of
+    these groups to the state of the input. If the file has none of the groups in this state, the
+    first one is made. Any other group, or a group of an input that fails, stays only if
+    `others_stay` returns True for the name of the group.
     """
     import_h5py()
     map_tasks, work = look_up("engine", engine, ENGINES), partial(_write_shard, make=make)

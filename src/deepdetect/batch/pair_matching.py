@@ -172,7 +172,7 @@ def match_pairs(
 
 
 def first_keypoints(features: Path) -> Keypoints | None:
-    """Return the first undamaged keypoints in a file, or None; all keypoints are of one kind."""
+    """Return the first undamaged keypoints in a file, or None; all keypoints in it are of one kind."""
     with open_hdf5(features) as file:
         for name in feature_names(file):
             with suppress(InvalidFileError):

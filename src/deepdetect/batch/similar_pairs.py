@@ -30,7 +30,7 @@ training descriptors on average. Chosen by hand."""
 
 KMEANS_ITERATIONS = 10
 TRAINING_IMAGES, TRAINING_DESCRIPTORS = 500, 50_000
-"""To save time, the vocabulary is trained on at most these numbers of images and descriptors."""
+"""The vocabulary is trained on at most these numbers of images and descriptors, to save time."""
 
 COMPARED_ROWS = 256
 """This many images are compared at once with all others, which takes 300 MB for 100,000 images."""

@@ -1,4 +1,4 @@
 """Drop-in replacements for parts of OpenCV, kornia, LightGlue and hloc.
 
-Importing a module raises a MissingExtraError if a package that it needs is not installed.
+Importing one of these modules raises a MissingExtraError if a package that it needs is missing.
 """

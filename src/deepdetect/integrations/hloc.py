@@ -186,7 +186,7 @@ class DeepDetectDenseMatcher(BaseModel):
 
 
 def register() -> None:
-    """Register the models with hloc; call this once in the program that calls hloc."""
+    """Register the extractor and the matchers with hloc; call this once before hloc runs."""
     models = (
         (hloc.extractors, NAME, DeepDetectExtractor),
         (hloc.matchers, NAME, DeepDetectMatcher),

@@ -23,7 +23,7 @@ from .collection import Collection, check_names
 
 MATCHES_NAME = "matches"
 DEFAULT_SIZE_PX = 3.0
-"""Keypoints without a size get this diameter in pixels, as if a dense keypoint were described."""
+"""Keypoints without a size get this diameter in pixels, as in `describe_collection`."""
 
 
 @suggest_keywords
@@ -43,7 +43,7 @@ def write_colmap(
         verify: estimate the two-view geometry of each pair, which COLMAP's mapper needs.
 
     Returns:
-        The file.
+        The path of the file.
 
     Raises:
         OptionError: the output does not end in .db, or an image has no camera.
@@ -75,7 +75,7 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
             matches.txt, which `colmap matches_importer --match_type raw` reads.
 
     Returns:
-        The files.
+        The paths of the files.
 
     Raises:
         OptionError: keypoints have no SIFT descriptors, which this format requires; a name in the

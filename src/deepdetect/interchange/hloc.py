@@ -1,6 +1,6 @@
 """Files of hloc: features, matches and pairs, in float32 and int32.
 
-hloc uses the pixel coordinates of DeepDetect. It adds half a pixel itself to those for COLMAP.
+hloc uses the pixel coordinates of DeepDetect, and itself adds the half pixel that COLMAP needs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         output: folder for the files.
 
     Returns:
-        The files. Without matches, matches.h5 and pairs.txt are not written.
+        The paths of the files. Without matches, matches.h5 and pairs.txt are not written.
 
     Raises:
         OptionError: two pairs would have the same group name, a name in the list of pairs has a
