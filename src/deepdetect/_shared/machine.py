@@ -31,7 +31,7 @@ Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
 PARTS_PER_THREAD = 4
-"""`parallel_for` makes this many parts per thread, so that a thread that ends early takes more."""
+"""`parallel_for` divides a range into this many parts per thread, so fast threads can take more."""
 
 TASKS_PER_WORKER = 8
 """`map_in_processes` queues this many tasks per worker, so that no worker idles. Chosen by hand."""
@@ -43,7 +43,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 """Environment variables that set the number of threads of libraries when they are loaded."""
 
 BYTES_PER = {
-    # The descriptor of a keypoint, and its part of a matcher's search trees.
+    # A keypoint's descriptor, and the keypoint's part of a matcher's search trees.
     "matched_keypoint": 1500,
     # Blending a panorama: a pixel of its canvas, and one of the largest image warped onto it.
     "canvas_pixel": 34,

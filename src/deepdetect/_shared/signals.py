@@ -45,7 +45,7 @@ def exit_by_signal(number: int, frame: FrameType | None) -> None:
 def noted_interrupts() -> Iterator[list[int]]:
     """Yield a list that gets an entry at each Ctrl-C, which still raises KeyboardInterrupt.
 
-    The list is needed because an interrupted import may raise another error instead of that one.
+    The list is needed because an interrupted import may hide that exception behind another one.
     """
     noted: list[int] = []
 

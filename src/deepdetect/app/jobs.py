@@ -168,7 +168,7 @@ class Jobs:
 def run_task(sender: Connection, order: Order) -> None:
     """Run a task in its own process: write files to the folder `results`, and send states."""
     if hasattr(os, "setsid"):
-        os.setsid()  # a process group, so that child processes can also be ended
+        os.setsid()  # makes a process group, so that child processes can be ended
     for stream in (1, 2):  # discard what libraries print
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     end_with_parent(kill_group)

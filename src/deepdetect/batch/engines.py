@@ -52,8 +52,8 @@ def map_on_ray(
     """Apply a function to every task on a Ray cluster, in workers of one processor each.
 
     The cluster is the one to which this process is connected, or else the one that RAY_ADDRESS
-    names, or else one that runs on this machine (`ray start`). Without any, or with
-    RAY_ADDRESS=local, a cluster is started for the duration of the work. All machines of the
+    names, or else one that runs on this machine (`ray start`). If there is none, or
+    with RAY_ADDRESS=local, a cluster is started for the duration of the work. All machines of the
     cluster need this package, and the files under the same paths. Raises a DeepDetectError if the
     cluster fails, or if the function raises one.
     """

@@ -56,8 +56,8 @@ def extract_features(
     - `scores` (N,) float32: higher is better.
     - `colors` (N, 3) uint8: sRGB colours at the keypoints.
     - `image_size` (2,) int32: width and height.
-    - `scales` (N,) and `oris` (N,) float32, if the keypoints have sizes and angles: sigma in
-      pixels, which is half the size, and the angle in degrees.
+    - `scales` (N,) and `oris` (N,) float32, if the keypoints have sizes and angles: half the size
+      (sigma) in pixels, and the angle in degrees.
 
     The same call continues an interrupted run. It skips unchanged images, adds new ones, and
     removes the groups of images that are missing or can no longer be read. A file is therefore for

@@ -152,7 +152,7 @@ def _written(path: Path, mode: str) -> Iterator[Any]:
     try:
         with import_h5py().File(path, mode, libver=FORMAT) as file:
             yield file
-    except (OSError, RuntimeError) as error:  # HDF5 raises both, with a long text
+    except (OSError, RuntimeError) as error:  # HDF5 raises either, with a long text
         number = re.search(r"errno = (\d+)", str(error))
         if number is None:
             raise

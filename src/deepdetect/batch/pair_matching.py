@@ -172,7 +172,7 @@ def match_pairs(
 
 
 def first_keypoints(features: Path) -> Keypoints | None:
-    """Return the first undamaged keypoints in a file, or None; all keypoints in it are of one kind."""
+    """Return the first undamaged keypoints in a file, or None; all of a file are of one kind."""
     with open_hdf5(features) as file:
         for name in feature_names(file):
             with suppress(InvalidFileError):
@@ -214,7 +214,7 @@ def _find_pairs(
 
 
 def _state(file: Any, name: str) -> State | None:
-    """Return numbers that change if an image's features change, or None if it lacks features."""
+    """Return numbers that change if an image's features change, or None if there are none."""
     try:
         group = file[name]
         if state := state_of(group):

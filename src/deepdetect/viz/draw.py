@@ -27,7 +27,7 @@ LINES, DOTS = 60, 1500
 `LINES` of the pairs are joined by a line. Chosen by hand."""
 
 SHOWN_PERCENTILE = 99.0
-"""Colour scales go from the 1st to this percentile of the values, so that outliers do not matter."""
+"""Colour scales span the 1st to this percentile of the values, so that outliers do not matter."""
 
 LEAST_DEPTH_LEVEL = 0.2
 """The farthest depth has this level (0 to 1) of the colour scale, because darker colours look like
