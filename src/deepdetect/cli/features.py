@@ -50,7 +50,7 @@ def extract(
     """
     file = cli.output_file(output, "features.h5")
     how = EXTRACTION.take(values)
-    chosen, selection = chosen_detector(  # each process gets a copy
+    chosen, selection = chosen_detector(  # one thread: each process gets a copy
         detector, values, options=DESCRIBED_POINTS, threads=1
     )
     report = extract_features(folder, file, chosen, selection=selection, quiet=False, **how)

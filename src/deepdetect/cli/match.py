@@ -78,9 +78,8 @@ def match(
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
     estimated geometry and its inliers, and a visualisation. The options --descriptor, --matcher,
-    --filter-by and --ratio are for --unguided.
-
-    Ends with exit code 3 if no geometry between the images can be trusted, or nothing matches.
+    --filter-by and --ratio are for --unguided. The exit code is 3 if nothing matches, or if no
+    geometry between the images can be trusted.
 
         deepdetect match left.jpg right.jpg
         deepdetect match page1.jpg page2.jpg --model homography --mutual
@@ -166,7 +165,6 @@ def _match_unguided(
     seed: int = 0,
     **values: Any,
 ) -> Matches:
-    """Match by descriptors alone, and estimate a geometry from these matches."""
     timer = StageTimer(progress)
     with timer.stage("keypoints"):
         chosen = {} if selection is None else vars(selection)
@@ -341,9 +339,8 @@ def stitch(
 ) -> cli.Result:
     """Stitch overlapping images, taken from one place or showing one plane, to a panorama.
 
-    The images may be in any order. Those that do not overlap with others, or cannot be read, are
-    left out and listed.
-    A flat panorama covers at most 100 to 120 degrees, a cylindrical or spherical one up to 360.
+    The images may be in any order. Images that overlap no other, or cannot be read, are left out
+    and listed. Flat panoramas cover at most 100 to 120 degrees, cylindrical or spherical ones 360.
 
         deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
         deepdetect stitch photos/ --projection cylindrical --crop -o panorama.jpg
@@ -388,7 +385,7 @@ def stitch(
                     progress=done,
                     **values,
                 )
-        except (OptionError, RegistrationError) as error:  # its message has indices, not names
+        except (OptionError, RegistrationError) as error:  # has indices in place of names
             text = str(error)
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))

@@ -54,7 +54,6 @@ def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarra
 
 
 def _scale(depths: np.ndarray) -> float:
-    """Choose the scale that covers all depths except outliers (see `HEADROOM`)."""
     if not len(depths):
         return 1.0
     return depth_scale(min(float(depths.max()), HEADROOM * float(np.percentile(depths, 99))))

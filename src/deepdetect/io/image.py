@@ -39,13 +39,11 @@ MINIMUM_SIDE = 16
 
 ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26
-"""A PNG file states its bit depth and its colour type within this many first bytes. `GREY_PNG` is
-the colour type of grey without alpha."""
+"""A PNG file states its bit depth and colour type (`GREY_PNG`: grey) in this many first bytes."""
 GREY_PNG = 0
 
 STRIP_PIXELS = 1 << 20
-"""PIL images are converted in strips of about this many pixels, because copies of a whole large
-image take gigabytes."""
+"""PIL images are converted in strips of this size, since copies of a large image take gigabytes."""
 
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda image: cv2.flip(image, 1),
@@ -136,7 +134,7 @@ def _load(
     *,
     deep: bool = False,
     raw: bool = False,
-    **for_arrays: Any,  # options of the call; those of a command apply to files only
+    **for_arrays: Any,  # options of this call; those of a command do not apply to arrays
 ) -> np.ndarray:
     if is_file(image):
         rgb = _read_file(image, options, deep, raw)
@@ -178,7 +176,7 @@ def batch_length(images: Images) -> int:
 
 @contextmanager
 def image_named(number: int) -> Iterator[None]:
-    """Add the image's index in its list to the messages of errors that the block raises."""
+    """Prefix messages of errors that the block raises with the index of the image in its list."""
     try:
         yield
     except (ImageError, OptionError) as error:
@@ -280,7 +278,7 @@ def _read_file(
                 else:
                     rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
                 orientation = orientation_of(image)
-            del image  # frees its pixels before turning makes another copy
+            del image  # frees its pixels before `UPRIGHT` makes another copy
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 
@@ -313,7 +311,7 @@ def _from_pil(
         raise damaged_image(name, error) from None
     if image.mode.startswith(("I", "F")):
         values = deep_values(image)
-        white = 65535 if image.format == "PPM" else None  # Pillow scales white to this in PPM
+        white = 65535 if image.format == "PPM" else None  # Pillow scales PPM to this
         return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)

@@ -25,8 +25,7 @@ from .tracks import TrackDrawer, TrackedFrame, write_tracks
 from .video import Frame, FrameSource, check_video_name, write_video
 
 MIN_SIDE_PX = 32
-"""`max_side`, the length of the longer side of scaled frames, must be at least this. Chosen by
-hand."""
+"""`max_side`, the longer side of scaled frames, must be at least this. Chosen by hand."""
 
 RATE_FRAMES = 10
 """The displayed frame rate is a mean over this number of frames."""
@@ -199,10 +198,9 @@ def output_files(output: str | Path) -> tuple[Path | None, Path]:
 
 @contextmanager
 def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether a signal has asked to end the recording of a live source.
+    """Yield a function that tells whether a signal has asked to end the recording of a camera.
 
-    The first Ctrl-C, SIGTERM or SIGHUP is only noted, so that the files are finished. A second one
-    ends the process at once, and leaves no file.
+    The first signal is only noted, so that the files are finished. A second one ends the process.
     """
     noted: list[int] = []
     with ExitStack() as handlers:

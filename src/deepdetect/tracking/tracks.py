@@ -19,8 +19,8 @@ from ..viz.draw import line_scale
 HEADER = "frame,track,x,y,score"
 
 HUE_STEP = 0.61803
-"""The hue advances by this fraction of the colour circle from one track to the next. With the
-golden ratio, tracks with successive numbers get clearly different colours."""
+"""From one track to the next, the hue advances by this fraction of the colour circle: the golden
+ratio, which gives successive tracks clearly different colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class TrackedFrame:
             frames.
         xy: (N, 2) float32 positions in pixels; the centre of the first pixel is (0, 0).
         scores: (N,) float32 scores of the keypoints with which the tracks began.
-        ages: (N,) int64 number of frames since each track began, 0 if it begins here.
+        ages: (N,) int64 numbers of frames since each track began; 0: it begins in this frame.
 
     Raises:
         OptionError: the arrays do not have one row for each track.
@@ -156,6 +156,6 @@ class TrackDrawer:
 
 
 def track_color(track: int) -> tuple[int, int, int]:
-    """Return the RGB colour of a track, which is bright and the same in all frames."""
+    """Return the RGB colour of a track number; it is bright."""
     red, green, blue = colorsys.hsv_to_rgb(track * HUE_STEP % 1, 0.8, 1.0)
     return round(255 * red), round(255 * green), round(255 * blue)

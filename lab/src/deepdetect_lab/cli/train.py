@@ -118,7 +118,7 @@ def chosen_recipe(
     labels = chosen_label_settings(detectors, label_settings)
     if label_settings is not None:
         values["labels"] = labels
-    elif detectors is not None:  # keep the preset's settings for these
+    elif detectors is not None:  # keeps the preset's settings of these
         values["labels"] = recipe.labels.with_detectors(labels.detectors)
     return replace(recipe, **values)
 
@@ -138,10 +138,9 @@ def train(
 ) -> cli.Result:
     """Train the network on the images, or the shards, in a folder.
 
-    First, labels are made once by the detectors of `deepdetect label`. The output folder gets the
-    weights with the lowest validation loss (best.safetensors and deepdetect.onnx), the loss curves
-    (curves.csv and curves.png), and checkpoint.safetensors, from which the same command resumes an
-    interrupted run.
+    First, the detectors of `deepdetect label` make the labels. The output folder gets the weights
+    with the lowest validation loss (best.safetensors, deepdetect.onnx), the loss curves
+    (curves.csv, curves.png), and checkpoint.safetensors, from which the command resumes.
 
         deepdetect train photos/ -o run
         deepdetect detect photo.jpg --weights run/deepdetect.onnx
@@ -186,9 +185,8 @@ def _train_on_pairs(
 def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the ranker of keypoints on the images in a folder.
 
-    Pairs of synthetic views are generated from single images, so no labels are needed. The output
-    folder gets best.npz, MODEL_CARD.md, the curves and a checkpoint. Run the same command again to
-    resume an interrupted run.
+    Needs no labels: it makes pairs of synthetic views from single images. Writes best.npz,
+    MODEL_CARD.md, training curves, and a checkpoint from which the same command resumes.
 
         deepdetect dev train-points photos/train --validation photos/val -o run
 
@@ -202,9 +200,9 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
 def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the learned descriptor of keypoints on the images in a folder.
 
-    Pairs of synthetic views are generated from single images, so no labels are needed. The output
-    folder gets descriptor.onnx, descriptor.safetensors, MODEL_CARD.md, the curves and a checkpoint.
-    Run the same command again to resume an interrupted run.
+    Needs no labels: it makes pairs of synthetic views from single images. Writes descriptor.onnx,
+    descriptor.safetensors, MODEL_CARD.md, training curves, and a checkpoint from which the same
+    command resumes an interrupted run.
 
         deepdetect train-descriptor photos/train --validation photos/val -o run
 
@@ -218,9 +216,9 @@ def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) ->
 def train_match_filter(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the network that separates correct matches from wrong ones by their neighbours.
 
-    Pairs of synthetic views are generated from single images. The output folder gets
-    match_filter.onnx, match_filter.safetensors, MODEL_CARD.md, the curves and a checkpoint. Run the
-    same command again to resume an interrupted run.
+    Needs no labels: it makes pairs of synthetic views from single images. Writes match_filter.onnx,
+    match_filter.safetensors, MODEL_CARD.md, training curves, and a checkpoint from which the same
+    command resumes an interrupted run.
 
         deepdetect dev train-match-filter photos/train --validation photos/val -o run
 
