@@ -125,8 +125,7 @@ def opencv() -> Iterator[Finding]:
 def self_test() -> Iterator[Finding]:
     """Detect with each back end, and match two synthetic pairs whose shifts are known.
 
-    The first pair shows a plane, the second a plane with a nearer square. The test also compiles
-    the functions that other commands need.
+    The first pair shows a plane, the second a plane with a nearer square.
     """
     import numpy as np
 
@@ -161,7 +160,7 @@ def self_test() -> Iterator[Finding]:
         column, row = np.rint(matches.points0).astype(int).T
         expected = np.array(shift) + near[row, column, :1] * np.array(off)
         errors.append(np.hypot(*(matches.points0 - matches.points1 - expected).T))
-    disparity_map(first, third)
+    disparity_map(first, third)  # compiles its functions for other commands
     wrong = np.concatenate(errors) >= 1
     precision, count = 1 - wrong.mean(), min(map(len, errors))
     value = f"{len(points)} points, {len(wrong):,} matches, {precision:.1%} of them correct"

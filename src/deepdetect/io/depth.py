@@ -13,8 +13,8 @@ from .._shared.records import save_arrays
 MAX_UINT16 = 65535
 
 HEADROOM = 4.0
-"""The scale of a PNG covers depths up to this many times their 99th percentile. If it also covered
-outliers beyond that, its steps would be coarse."""
+"""A PNG stores depths up to this many times their 99th percentile. If it also stored outliers
+beyond this limit, its depth steps would be coarse."""
 
 
 def save_depth_png(

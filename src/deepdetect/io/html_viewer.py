@@ -25,7 +25,7 @@ DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
 Chosen by hand."""
 
 MAX_LEVEL = 65535
-"""Along each axis, positions are stored as 16-bit integers from 0 to this number."""
+"""Positions along each axis are stored as integers from 0 to this number, in 16 bits."""
 
 MARGIN = 1.0
 """Points are left out if they lie outside the robust box by more than this times its size, because

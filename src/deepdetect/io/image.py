@@ -54,7 +54,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: cv2.flip(cv2.transpose(image), -1),
     8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
 }
-"""Each EXIF orientation from 2 on has a function here that turns an image upright."""
+"""Functions that turn an image upright, by the EXIF orientation of the image."""
 
 
 @suggest_keywords
@@ -212,7 +212,7 @@ def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """List the image files below a folder in natural order: "2.png" comes before "10.png".
 
-    Visualisations that commands of this package have written there are left out.
+    Images that commands of this package have written into the folder are left out.
 
     Raises:
         ImageError: the folder is missing, is a file, or has no image outside of `exclude`.
@@ -249,8 +249,8 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
 def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str, Path]:
     """Return a dictionary of the given image files and those below the given folders, by name.
 
-    The name of an image is its path relative to the given folder; for a given file it is the file
-    name. If two names would be the same, all are relative to the common parent folder.
+    A given file has its file name, other images have their path relative to the given folder. If
+    two names would be the same, all names are paths relative to the common parent folder.
     """
     names: dict[Path, Path] = {}
     for path in paths:

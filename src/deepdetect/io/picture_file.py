@@ -220,7 +220,7 @@ def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
         kept = _kept_exif(exif) if kind == "TIFF" else exif
         found = replace(found, exif=kept if len(kept) else None)
         orientation = exif.get(Base.Orientation, 1)
-    # The georeference applies to the image as it is stored, not turned upright.
+    # The georeference applies to the stored image, before it is turned upright.
     if placed and path is not None and kind in PLACED_FORMATS and orientation == 1:
         found = replace(found, **_read_place(path, page))
     return found
@@ -288,7 +288,7 @@ def _of_tiff(file: Any) -> tuple[Metadata, Any]:
 
 
 def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
-    """Write a (H, W, 3) uint8 or uint16 RGB image with metadata as .png, .tif or .jpg, atomically."""
+    """Write (H, W, 3) uint8 or uint16 RGB with its metadata as .png, .tif or .jpg, atomically."""
     suffix = picture_suffix(path)
     if suffix.startswith(".tif"):
         metadata.write_tiff(rgb, Path(path))

@@ -1,6 +1,6 @@
 """Reading TIFF files: the choice of the page, and the conversion of its values to RGB.
 
-Each tag that changes the meaning of pixels is respected, or the error names it.
+If a tag changes the meaning of pixels, the tag is respected, or an error names it.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ RIDGE = 1e-4
 singular for a patch that shows only parallel edges. Chosen by hand."""
 
 MOST_READ = 1 << 14
-"""At most this many patches are read at once, since OpenCV limits sides of images to 32,767 px."""
+"""Patches read at once are at most this many, since OpenCV limits sides of images to 32,767 px."""
 
 
 class Patches(NamedTuple):

@@ -130,7 +130,7 @@ def track(
         max_frames: largest number of frames that are taken. None: all.
         max_side: frames whose longer side has more pixels than this are scaled down to it for the
             tracking only. None: no limit.
-        tail: number of positions of a track that are drawn: the last ones.
+        tail: number of latest positions that are drawn of each track.
         quiet: show no progress bar.
 
     Returns:
@@ -188,7 +188,7 @@ def track(
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:
-    """Return the paths of the video, or None if none is written, and of the CSV file."""
+    """Return the paths of the video (None if `output` ends in .csv) and of the CSV file."""
     path = Path(output)
     if path.suffix.lower() == ".csv":
         return None, path

@@ -19,7 +19,7 @@ from ..viz.draw import line_scale
 HEADER = "frame,track,x,y,score"
 
 HUE_STEP = 0.61803
-"""From one track to the next, the hue advances by this fraction of the colour circle: the golden
+"""The hue advances by this fraction of the colour circle from each track to the next: the golden
 ratio, which gives successive tracks clearly different colours."""
 
 

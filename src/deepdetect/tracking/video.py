@@ -60,7 +60,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
     Attributes:
         live: whether the source is a camera, which has no end.
-        fps: frames per second of the frames that are taken: the source's rate divided by `every`.
+        fps: frame rate of the frames that are taken: the source's rate divided by `every`.
         count: number of frames to take if the file states its length correctly; None if unknown.
         failures: a sentence on each image of a folder that has been left out so far, because it
             cannot be read or differs in size from the first one.

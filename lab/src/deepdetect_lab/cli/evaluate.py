@@ -159,7 +159,7 @@ def compare_clouds(
 
     Prints how much of the images each cloud covers, and how much its depths differ from those of
     model.ply. The clouds must be in the coordinate frame of the model, so run OpenMVS or COLMAP on
-    its sparse/0.
+    the model's sparse/0.
 
         deepdetect dev compare-clouds model/ openmvs/scene_dense.ply colmap/fused.ply
     """

@@ -84,7 +84,7 @@ FILTER_RUN = replace(PAIRS_RUN, common="validation")
 def chosen_label_settings(
     detectors: str | None = None, label_settings: str | None = None
 ) -> LabelOptions:
-    """Find label settings by name or TOML file, and replace the detectors if others are given.
+    """Return label settings by name or TOML file; `detectors` replace the detectors in them.
 
     Args:
         detectors: Detectors, separated by commas: sift, orb, brisk, fast, agast, harris,
@@ -108,9 +108,9 @@ def chosen_recipe(
     """Return a preset's training options with the given values changed.
 
     Args:
-        preset: Recipe, whose values other options override: default (its values are shown here),
-            dense (normal light only, denser labels), espnet (trains ESPNet), or paper (trains
-            ESPNet as in the paper).
+        preset: Recipe: default (its values are shown here), dense (normal light only, denser
+            labels), espnet (trains ESPNet), or paper (trains ESPNet as in the paper); other options
+            override its values.
     """
     if "stages" in values:
         values["stages"] = tuple(map(Stage.parse, values["stages"]))
@@ -329,8 +329,8 @@ def average(
 ) -> cli.Result:
     """Average weights (a model soup) into best.safetensors and deepdetect.onnx.
 
-    The mean of the weights of successive runs is often better than those of each run. A single file
-    is just converted to ONNX. Files of another average are only replaced with --overwrite.
+    The mean of the weights of successive runs often scores better than each run. A single file is
+    only converted to ONNX. Files of another average are only replaced with --overwrite.
 
         deepdetect dev average first/best.safetensors second/best.safetensors -o mean
         deepdetect dev evaluate samples/ --weights mean/deepdetect.onnx
