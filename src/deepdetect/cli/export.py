@@ -162,7 +162,7 @@ def _export(
 ) -> cli.Result:
     """Read a collection, or compute it from a folder of images, and write it to `output`.
 
-    A record with the file `marker` names the inputs of the whole output.
+    The record of the file `marker` names the inputs of all output files.
     """
     named = [Path(values[name]) for name in ("matches", "pairs") if name in values]
     inputs = [*sources, *(path for path in named if path.exists())]

@@ -38,8 +38,7 @@ def extract(
     """Extract the keypoints and descriptors of all images below a folder.
 
     Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. Run the same command
-    again to resume after an interruption, or to update the file: it adds new and changed images,
-    and removes the features of deleted images.
+    again to resume, or to update the file for new, changed and deleted images.
 
         deepdetect extract photos/ -o features.h5
         deepdetect extract photos/ -o features.h5 --engine ray --workers 64

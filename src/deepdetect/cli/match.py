@@ -89,8 +89,7 @@ def match(
     Args:
         pairs: Which of more than two images to match: exhaustive (all pairs), sequential:1 (each
             image with the next by name), or a text file with the names of two images on each line.
-        unguided: Match by descriptors alone, over the whole image, and estimate a geometry from
-            these matches.
+        unguided: Match by descriptors alone over the whole image, then estimate a geometry.
         homography: Text file with a known 3x3 homography from the first image to the second.
             Matches that agree with it are the inliers.
         camera0: Text file with the 3x3 matrix of the first camera, for --model essential.
@@ -285,8 +284,7 @@ def register(
         deepdetect register ortho.tif drone.tif --bands 3 2 1 --extent union --apply-to thermal.tif
 
     Args:
-        apply_to: More images with the size and the view of the second image, such as a thermal
-            band. They are warped by the same homography.
+        apply_to: More images to warp, with the size and view of the second, such as thermal bands.
     """
     reference, folder = read_metadata(image0, placed=True), cli.output_folder(output)
     own = {path: read_metadata(path) for path in (image1, *apply_to)}

@@ -23,9 +23,9 @@ def save_depth_png(
     """Write a depth map as a 16-bit grey PNG, atomically; return a summary of its content.
 
     A pixel is round(depth * value_per_unit), or 0 if the depth is unknown (not finite, 0 or less).
-    `value_per_unit` is `scale`. By default it is the finest of 1, 2 or 5 times a power of ten that
-    covers depths up to 4 times the 99th percentile. Larger depths are written as unknown, and the
-    summary counts them as `out_of_range`. The PNG has text chunks `unit` and `value_per_unit`.
+    `value_per_unit` is `scale`. By default it is the largest number 1, 2 or 5 times a power of ten
+    with which 16 bits cover all depths up to 4 times the 99th percentile. Other depths are written
+    as unknown and counted as `out_of_range`. The PNG has text chunks `unit` and `value_per_unit`.
     """
     known = np.isfinite(depth) & (depth > 0)
     scale = scale or _scale(depth[known])
@@ -60,7 +60,7 @@ def _scale(depths: np.ndarray) -> float:
 
 
 def depth_scale(furthest: float) -> float:
-    """Return the finest scale, 1, 2 or 5 times a power of ten, that fits a depth into 16 bits."""
+    """Return the largest scale, 1, 2 or 5 times a power of ten, that fits a depth into 16 bits."""
     finest = MAX_UINT16 / furthest
     power = 10.0 ** np.floor(np.log10(finest))
     return float(max(step * power for step in (1, 2, 5) if step * power <= finest * (1 + 1e-12)))

@@ -276,7 +276,7 @@ def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
 
 @functools.cache
 def _standard_input() -> bytes:
-    """Return the content of standard input, which can be read only once, from a cache."""
+    """Return the content of standard input; it is cached because it can be read only once."""
     if sys.stdin is None:
         raise ImageError("there is no standard input: give the file")
     return sys.stdin.buffer.read()

@@ -72,8 +72,7 @@ def track_frames(
     Args:
         source: a source that was opened in a `with` block.
         tracker: a new tracker.
-        max_side: frames whose longer side has more pixels than this are scaled down to it for the
-            tracker. None: frames are not scaled.
+        max_side: larger frames are scaled for the tracker to this longer side. None: no scaling.
 
     Returns:
         Iterator over pairs of a frame, (H, W, 3) uint8 RGB, and its tracks. Positions are in pixels
@@ -123,13 +122,11 @@ def track(
         source: a video file, a folder of images, or the number of a camera.
         output: video ending in .mp4, .mov, .mkv or .avi; the CSV file next to it has the columns
             frame, track, x, y and score. If it ends in .csv, no video is written.
-        detector: detector of the points. None: a `PointDetector` that finds `CANDIDATES` times as
-            many points as tracks are wanted.
+        detector: detector of points. None: a `PointDetector` of `CANDIDATES` points per track.
         options: how points are followed.
         every: process every N-th frame.
         max_frames: largest number of frames that are taken. None: all.
-        max_side: frames whose longer side has more pixels than this are scaled down to it for the
-            tracking only. None: no limit.
+        max_side: for the tracking only, scale larger frames to this longer side. None: no limit.
         tail: number of latest positions that are drawn of each track.
         quiet: show no progress bar.
 

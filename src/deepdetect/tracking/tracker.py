@@ -30,8 +30,7 @@ Detect = Callable[[np.ndarray], Keypoints]
 """A function that returns the keypoints of a (H, W, 3) uint8 RGB image."""
 
 CANDIDATES = 3
-"""The default detector finds this many keypoints for each track that is wanted, so that enough of
-them are far from existing tracks and from each other."""
+"""The detector finds this many keypoints per track, so that enough are far from existing tracks."""
 
 MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
 """A new point keeps the larger of two distances from all tracks: the first number in pixels, or the

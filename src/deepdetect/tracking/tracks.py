@@ -29,8 +29,7 @@ class TrackedFrame:
 
     Attributes:
         number: number of the frame in the source, from 0 on.
-        tracks: (N,) int64 numbers of the tracks, ascending; a track has the same number in all
-            frames.
+        tracks: (N,) int64 track numbers, ascending; a track keeps its number in all frames.
         xy: (N, 2) float32 positions in pixels; the centre of the first pixel is (0, 0).
         scores: (N,) float32 scores of the keypoints with which the tracks began.
         ages: (N,) int64 numbers of frames since each track began; 0: it begins in this frame.
@@ -59,7 +58,7 @@ class TrackedFrame:
 
 @contextmanager
 def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
-    """Open a CSV file of tracks, which appears, complete, only if the block ends without an error.
+    """Open a CSV file of tracks; the file appears only if the block ends without an error.
 
     The block gets a function that writes the rows of a frame: frame, track, x, y and score.
     """

@@ -62,8 +62,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         live: whether the source is a camera, which has no end.
         fps: frame rate of the frames that are taken: the source's rate divided by `every`.
         count: number of frames to take if the file states its length correctly; None if unknown.
-        failures: a sentence on each image of a folder that has been left out so far, because it
-            cannot be read or differs in size from the first one.
+        failures: a sentence on each image so far that cannot be read or differs in size from the first.
 
     Raises:
         MissingFileError: there is no such file, folder or camera.
@@ -186,7 +185,7 @@ def check_video_name(path: str | Path) -> str:
 
 @contextmanager
 def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Open a video file, which appears, complete, only if the block ends without an error.
+    """Open a video file; the file appears only if the block ends without an error.
 
     The block gets a function that writes a (H, W, 3) uint8 RGB frame; all frames must have the same
     size. The finished file is checked, because OpenCV does not report frames that it cannot write.

@@ -233,8 +233,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """Pack the images in a folder with their labels into tar files.
 
     The files have WebDataset's layout. Training reads a few of them at a time, so they may be on a
-    slow disk or a network drive. Give `train` the same options as this command. Run the same
-    command again to resume after an interruption.
+    slow disk or a network drive. Give `train` the same options. To resume, run the command again.
 
         deepdetect dev shards --preset paper data/coco -o data/shards
         deepdetect train --preset paper data/shards -o run
@@ -278,8 +277,7 @@ def label(
 
     Args:
         output: Folder for the masks.
-        visualize: Also write STEM_labels.png: image, keypoint mask, edge mask and both combined, as
-            in the paper's Figure 4.
+        visualize: Also write STEM_labels.png, a figure of the image and its masks.
         workers: Number of processes.  [default: one per processor]
     """
     folder = cli.output_folder(output)
