@@ -77,7 +77,7 @@ Commands = Mapping[str, Mapping[str, tuple[str, str]]]
 
 
 class HelpFormatter(DefaultFormatter):
-    """Format help as cyclopts does, but unless `shows_all`, print how many `MORE` options exist."""
+    """Format help as cyclopts does, but only count the `MORE` options unless `shows_all`."""
 
     shows_all = False
 

@@ -281,7 +281,7 @@ def writing(
 
 
 def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
-    """Return a sentence and a table of the named values; stages in "seconds" are summed."""
+    """Return a sentence and a table of the named values; the times in "seconds" are summed."""
     shown = {name: values.get(name) for name in names.split()}
     if isinstance(seconds := shown.get("seconds"), Mapping):
         shown["seconds"] = sum(seconds.values())

@@ -144,7 +144,7 @@ def hloc(
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
-    """Return the marker file of an export; if it is missing, the folder must be empty or new."""
+    """Return an export's marker file; if it is missing, only `overwrite` allows other files."""
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")

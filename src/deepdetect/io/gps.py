@@ -61,7 +61,7 @@ def read_gps(path: Path) -> GpsFix | None:
     )
     below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01")
     altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if below_sea else 1)
-    # Older drones write Longtitude.
+    # Older drones write "Longtitude".
     east = drone.get("GpsLongitude", drone.get("GpsLongtitude", np.nan))
     if np.isfinite(east) and np.isfinite(north := drone.get("GpsLatitude", np.nan)):
         latitude, longitude = (north, east) if north or east else (latitude, longitude)
@@ -90,7 +90,7 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 
 def _degrees(value: Any, sign: Any, below: str) -> float:
-    """Convert (degrees, minutes, seconds), negative if `sign` is `below`; NaN for other values."""
+    """Convert degrees, minutes, seconds to degrees: < 0 if `sign` is `below`, NaN if invalid."""
     try:
         degrees, minutes, seconds = (_number(part) for part in value)
     except (TypeError, ValueError):

@@ -311,7 +311,7 @@ def _from_pil(
         raise damaged_image(name, error) from None
     if image.mode.startswith(("I", "F")):
         values = deep_values(image)
-        white = 65535 if image.format == "PPM" else None  # Pillow scales PPM to this
+        white = 65535 if image.format == "PPM" else None  # Pillow scales white to this in PPM
         return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)

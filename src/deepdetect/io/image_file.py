@@ -330,7 +330,7 @@ def identify(file: BinaryIO, name: str) -> Any:
         factory, accept = Image.OPEN[key]
         try:
             accepted = accept is None or accept(start)
-            if accepted and not isinstance(accepted, str):  # a string: what is missing
+            if accepted and not isinstance(accepted, str):  # a string names a missing library
                 file.seek(0)
                 return factory(file, "")
         except (SyntaxError, IndexError, TypeError, struct.error):

@@ -78,7 +78,7 @@ class Metadata:
     plain: bool = True
 
     def moved(self, matrix: np.ndarray | None) -> Metadata:
-        """Return the metadata of the image after a warp by an affine (3, 3) matrix, if known."""
+        """Return the metadata after a warp by an affine (3, 3) matrix; None: the warp is unknown."""
         if self.to_world is None or matrix is None:
             return replace(self, to_world=None, crs=None)
         return replace(self, to_world=self.to_world @ np.linalg.inv(matrix / matrix[2, 2]))
@@ -171,7 +171,7 @@ class Metadata:
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
-    """Return whether there are EXIF values that Pillow can write; some it can only read."""
+    """Return whether there are EXIF values, all of which Pillow can write; it only reads some."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     directory = ImageFileDirectory_v2()

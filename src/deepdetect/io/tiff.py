@@ -34,7 +34,7 @@ ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
 MAX_BYTES_PER_PIXEL = 256
-"""Files with more are rejected, since a small file can claim to have any number of bands."""
+"""Files with more bytes per pixel are rejected, since small files can claim any number of bands."""
 
 
 def read_tiff(

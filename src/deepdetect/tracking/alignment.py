@@ -44,7 +44,7 @@ RIDGE = 1e-4
 singular for a patch that shows only parallel edges. Chosen by hand."""
 
 MOST_READ = 1 << 14
-"""Patches read at once are at most this many, since OpenCV limits sides of images to 32,767 px."""
+"""OpenCV limits the sides of images to 32,767 px, so at most this many patches are read at once."""
 
 
 class Patches(NamedTuple):
@@ -149,7 +149,7 @@ def _pixels() -> tuple[np.ndarray, np.ndarray]:
 
 def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
     """Return the (N, P) values of an image at the pixels of N patches warped by the affinities."""
-    # The kernel is not cubic, because OpenCV's cubic kernel shifts the image by up to 0.05 px.
+    # Lanczos interpolation is used, because OpenCV's cubic kernel shifts by up to 0.05 px.
     places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ _pixels()[0]
     parts = np.array_split(places, len(places) // MOST_READ + 1)
     return np.concatenate(

@@ -127,7 +127,7 @@ def track(
         every: process every N-th frame.
         max_frames: largest number of frames that are taken. None: all.
         max_side: for the tracking only, scale larger frames to this longer side. None: no limit.
-        tail: number of latest positions that are drawn of each track.
+        tail: number of positions that are drawn of each track: the latest ones.
         quiet: show no progress bar.
 
     Returns:

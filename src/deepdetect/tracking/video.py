@@ -62,7 +62,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         live: whether the source is a camera, which has no end.
         fps: frame rate of the frames that are taken: the source's rate divided by `every`.
         count: number of frames to take if the file states its length correctly; None if unknown.
-        failures: a sentence on each image so far that cannot be read or differs in size from the first.
+        failures: a sentence on each image that was unreadable, or differed in size from the first.
 
     Raises:
         MissingFileError: there is no such file, folder or camera.

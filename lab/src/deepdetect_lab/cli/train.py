@@ -327,7 +327,7 @@ def average(
 ) -> cli.Result:
     """Average weights (a model soup) into best.safetensors and deepdetect.onnx.
 
-    The mean of the weights of successive runs often scores better than each run. A single file is
+    The mean of the weights of successive runs often scores better than any run. A single file is
     only converted to ONNX. Files of another average are only replaced with --overwrite.
 
         deepdetect dev average first/best.safetensors second/best.safetensors -o mean
