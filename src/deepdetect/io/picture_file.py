@@ -78,7 +78,7 @@ class Metadata:
     plain: bool = True
 
     def moved(self, matrix: np.ndarray | None) -> Metadata:
-        """Return the metadata after a warp by an affine (3, 3) matrix; None: the warp is unknown."""
+        """Return the metadata after a warp by an affine (3, 3) matrix; None: an unknown warp."""
         if self.to_world is None or matrix is None:
             return replace(self, to_world=None, crs=None)
         return replace(self, to_world=self.to_world @ np.linalg.inv(matrix / matrix[2, 2]))
