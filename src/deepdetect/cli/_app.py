@@ -64,14 +64,11 @@ COMMANDS = {
         "completion": ("_app", "Print a script that completes commands and options by Tab."),
     },
 }
-"""The commands of this package, by group. Each has the module of its function and a summary."""
+"""The commands of this package by group: for each, the module of its function, and a summary."""
 
 LAB_ENTRY_POINTS = "deepdetect.commands"
-"""deepdetect-lab adds commands by entry points of this group. Each entry point is a table like
-`COMMANDS`, but with the full names of the modules.
-
-The entry point `dev` is the table of the commands `deepdetect dev NAME`.
-"""
+"""Group of the Python entry points by which deepdetect-lab adds commands. Each entry point is a
+table like `COMMANDS`, but with full module names; `dev` has the commands `deepdetect dev NAME`."""
 
 LAB_COMMANDS = ("label", "train", "train-descriptor", "dev")
 """Commands of deepdetect-lab. If it is not installed, calling one gives an error that says so."""
@@ -80,7 +77,7 @@ Commands = Mapping[str, Mapping[str, tuple[str, str]]]
 
 
 class HelpFormatter(DefaultFormatter):
-    """Format help as cyclopts does, but by default only count the options in the group `MORE`."""
+    """Format help as cyclopts does, but only count the `MORE` options unless `shows_all`."""
 
     shows_all = False
 
@@ -99,10 +96,9 @@ FORMATTER = HelpFormatter()
 
 @functools.cache
 def make_app(summaries: bool = False) -> App:
-    """Return the application; it imports the module of a command only when the command is called.
+    """Return the application, which imports a command's module only when the command is called.
 
-    With `summaries`, the list of commands in the help shows the summaries in `COMMANDS`; otherwise
-    it shows the docstrings of the commands.
+    If `summaries`, the help lists the summaries in `COMMANDS` in place of the docstrings.
     """
     commands, development = _all_commands()
     app = App(
@@ -142,15 +138,13 @@ def _all_commands() -> tuple[Commands, Commands]:
 
 
 def _module_of(words: Sequence[str]) -> str | None:
-    """Return the module of the command that the words call, or None if they call none.
-
-    Entry points are read only if this package has no such command, because reading takes time.
-    """
+    """Return the module of the command that the command line calls, or None if it calls none."""
     name = next((word for word in words if word != "dev"), "")
     if words[:1] != ["dev"]:
         own = (group[name][0] for group in COMMANDS.values() if name in group)
         if module := next(own, None):
             return f"{__package__}.{module}"
+    # Reading the entry points of other packages takes time, so it is done only now.
     commands, development = _all_commands()
     if words[:1] and words[0] in LAB_COMMANDS and not development:
         raise MissingExtraError(
@@ -241,8 +235,7 @@ def _failed(text: str, code: int) -> int:
 def with_flags(message: str, words: Sequence[str]) -> str:
     """In a message of the library, replace the names of parameters by the command's options.
 
-    A word is taken for a parameter if it has an underscore or is in backticks. In backticks it may
-    have a value.
+    A word that has an underscore or is in backticks counts as a parameter; `NAME=VALUE` also does.
 
     Example:
         >>> with_flags("set nms_radius, or `pictures=False`", ["detect"])

@@ -32,7 +32,7 @@ NETWORK = From(
 )
 POINTS = From(PointDetector, more="spread ranker")
 ONE_THREAD = replace(NETWORK, defaults={"threads": "1"})
-"""Options of the network for commands that run one detector, with one thread, per process."""
+"""Options of the network for commands that run one detector with one thread in each process."""
 
 DESCRIBED_POINTS = From(PointDetector, more="spread ranker descriptor")
 SELECTION = From(
@@ -50,11 +50,10 @@ def chosen_detector(
     options: From = POINTS,
     **defaults: Any,
 ) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
-    """Make the chosen detector and its selection options, and take their options out of `values`.
+    """Return the detector `kind` and its selection options, which are None for "points".
 
-    `options` are those of the detector "points". Where `values` does not say otherwise, "points"
-    finds at most `max_keypoints` points, and the network has the options `defaults`. "points" has
-    no selection options, so None is returned for them.
+    The options of both detectors are taken out of `values`. `options` names those of "points".
+    Defaults are `max_keypoints` for "points", and `defaults` for the network.
     """
     network, points, selection = (source.take(values) for source in (NETWORK, options, SELECTION))
     if kind == "points":

@@ -105,12 +105,11 @@ class Result:
     """The result of a command, which is printed when it returns.
 
     Attributes:
-        values: the values that --json prints. If there is no text, the terminal shows them as a
-            table.
+        values: what --json prints. If there is no text, the terminal shows `values` as a table.
         text: output for the terminal: the most important facts, at most a dozen lines.
         failures: a sentence about each input that failed. If there are any, the exit code is 1.
-        total, what: number of the inputs (0 if unknown), and what they are, in the plural. If there
-            is one input and it fails, its failure is raised as the error.
+        total, what: number of inputs (0 if unknown), and a plural noun for them. If the only input
+            fails, its failure is raised as the error.
         exit_code: exit code if nothing failed.
     """
 
@@ -140,7 +139,7 @@ def command(
 ) -> Callable[[Callable[..., Result | None]], Callable[..., int]]:
     """Turn a function into a command, which prints its result and has the option --json.
 
-    The options of the `sources` that a user gives reach the function as its `**values`.
+    Options of `sources` that the user sets are passed to the function as `**values`.
     """
 
     def decorate(function: Callable[..., Result | None]) -> Callable[..., int]:
@@ -200,7 +199,7 @@ def output_file(output: Path, name: str) -> Path:
 
 
 def output_files(output: Path, stem: str, endings: Mapping[str, str]) -> dict[str, Path]:
-    """Return the output file of each kind: `stem` and the kind's ending, in the folder -o.
+    """Return the output file of each kind: `stem` plus the ending of the kind, in the folder -o.
 
     If there is only one kind, -o may also be the .npz or .csv file itself.
     """
@@ -219,13 +218,12 @@ def output_folder(output: Path) -> Path:
 def expand_images(paths: Sequence[Path], output: Path) -> dict[str, Path]:
     """Return the given images and those below the given folders, named as by `name_images`.
 
-    Images in the output folder are left out. So are, with a message, given images that a command
-    made from other given images.
+    Images in the output folder are left out; so are results of other given images, with a message.
     """
     given = {str(path.resolve()) for path in paths}
     kept = []
     for path in paths:
-        if given & {*inputs_of(path)}:  # happens if a user gives *.jpg
+        if given & {*inputs_of(path)}:  # as with *.jpg, which also matches results
             say(f"{path} is a result from other given images, and is left out")
         else:
             kept.append(path)
@@ -233,7 +231,7 @@ def expand_images(paths: Sequence[Path], output: Path) -> dict[str, Path]:
 
 
 def result_stems(images: Mapping[str, Path]) -> dict[Path, str]:
-    """Return the stem of each image's results: its name, without suffix if that stays unique."""
+    """Return the stem of each image's result files: its name, without suffix if that is unique."""
     stems = {name: name.removesuffix(path.suffix) for name, path in images.items()}
     count = Counter(stems.values())
     return {path: stems[n] if count[stems[n]] == 1 else n for n, path in images.items()}
@@ -283,10 +281,7 @@ def writing(
 
 
 def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
-    """Return a sentence and, below it, a table of the values whose names are given.
-
-    If "seconds" has a time for each stage, the table shows their sum.
-    """
+    """Return a sentence and a table of the named values; the times in "seconds" are summed."""
     shown = {name: values.get(name) for name in names.split()}
     if isinstance(seconds := shown.get("seconds"), Mapping):
         shown["seconds"] = sum(seconds.values())
@@ -296,8 +291,7 @@ def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
 def table(*columns: Mapping[str, Any], title: str = "", wrapped: bool = False) -> str:
     """Return a text table: each row has a name and its value in each of the columns.
 
-    Lists of lists or of mappings are left out. Long values are wrapped if `wrapped`; otherwise each
-    stays on one line, so that it can be copied.
+    Lists of lists or of mappings are left out. Long values are wrapped only if `wrapped`.
     """
     texts = [dict(_table_rows(values)) for values in columns]
     names = dict.fromkeys(name for column in texts for name in column)

@@ -57,9 +57,7 @@ def run_demo(
     detector: HeatmapDetector,
     folder: Path,
 ) -> dict[str, Any]:
-    """Match a stereo pair, evaluate the matches, write visualisations, and return the numbers.
-
-    For comparison, the same number of random points is also matched, by descriptors alone.
+    """Match a stereo pair, and random pixels for comparison; write pictures, return the scores.
 
     Args:
         left, right: (H, W, 3) uint8 RGB, rectified.

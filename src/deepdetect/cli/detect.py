@@ -57,11 +57,10 @@ def detect(
         deepdetect detect photo.jpg --density 0.1 --no-pictures -o points.csv
 
     Args:
-        ignore: Mask image of the same size as the images. Where it is bright, no keypoints are
-            taken.
+        ignore: Mask image of the same size as the images: bright pixels get no keypoints.
         pictures: Also write visualisations.
     """
-    import_opencv()  # fails before anything is written if it is missing
+    import_opencv()  # if OpenCV is missing, fails before anything is written
     stems = cli.result_stems(cli.expand_images(images, output))
     paths = [*stems]
     drawn = ("keypoints", "dense", "heatmap") if detector == "network" else ("keypoints",)
@@ -170,7 +169,7 @@ class _Work:
                 save_picture(draw_logits(logits), made["heatmap"])
             written = [file.name for file in outputs.paths]
             noted |= {"numbers": numbers, "settings": self.settings, "files": written}
-        for name in (earlier or {}).get("files", ()):  # files of the earlier run
+        for name in (earlier or {}).get("files", ()):
             old = files["file"].with_name(name)
             with contextlib.suppress(OptionError):  # keeps a file that was changed since
                 if old not in outputs.paths and Outputs([old], [path]).find():

@@ -27,13 +27,11 @@ PURPOSES = {
 MAX_BACKEND_DIFFERENCE = 5e-3
 """Two back ends may differ by this much in their probabilities, five times what is usual."""
 TIMED_ROUNDS = 5
-"""The benchmark measures this many runs, after a first one that loads and compiles. Chosen by
-hand."""
+"""The benchmark times this many runs, after a first one that compiles. Chosen by hand."""
 NEAR_SHIFT_PX = 16
 """Disparity in pixels of the foreground in the second pair of the self-test. Chosen by hand."""
 MIN_PRECISION = 0.95
-"""The self-test fails below this fraction of correct matches. On a working installation all are
-correct. Chosen by hand."""
+"""The self-test fails below this fraction of correct matches. Usually it is 1. Chosen by hand."""
 
 
 class Finding(NamedTuple):
@@ -66,7 +64,7 @@ def doctor(
     for check in CHECKS:
         try:
             findings += check()
-        except Exception as error:  # a broken installation raises all kinds
+        except Exception as error:  # a broken installation raises errors of any kind
             kind = "" if isinstance(error, DeepDetectError) else f"{type(error).__name__}: "
             reason = kind + first_line(error)
             findings.append(Finding(check.__name__, "problem", "does not work", reason))
@@ -127,8 +125,7 @@ def opencv() -> Iterator[Finding]:
 def self_test() -> Iterator[Finding]:
     """Detect with each back end, and match two synthetic pairs whose shifts are known.
 
-    The first pair shows a plane, the second a plane with a nearer square. The test also compiles
-    the functions that other commands need.
+    The first pair shows a plane, the second a plane with a nearer square.
     """
     import numpy as np
 
@@ -163,7 +160,7 @@ def self_test() -> Iterator[Finding]:
         column, row = np.rint(matches.points0).astype(int).T
         expected = np.array(shift) + near[row, column, :1] * np.array(off)
         errors.append(np.hypot(*(matches.points0 - matches.points1 - expected).T))
-    disparity_map(first, third)
+    disparity_map(first, third)  # compiles its functions for other commands
     wrong = np.concatenate(errors) >= 1
     precision, count = 1 - wrong.mean(), min(map(len, errors))
     value = f"{len(points)} points, {len(wrong):,} matches, {precision:.1%} of them correct"

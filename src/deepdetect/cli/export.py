@@ -97,7 +97,7 @@ def colmap(
             raise OptionError(f"text files hold no cameras: leave out `{name}`, or write a .db")
         marker = _new_folder(output, "matches.txt", overwrite)
         return _export(write_colmap_text, sources, output, marker, overwrite, values)
-    import_pycolmap("a database of COLMAP")  # fails before the work if it is missing
+    import_pycolmap("a database of COLMAP")  # if pycolmap is missing, fails early
     calibration, focal_px = cameras.get("calibration"), cameras.get("focal_px")
     if calibration is not None and focal_px is not None:
         raise OptionError("give --calibration or --focal, not both")
@@ -128,9 +128,7 @@ def hloc(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Write features.h5, matches.h5 and pairs.txt for hloc.
-
-    These files are the arguments of hloc.reconstruction.main.
+    """Write features.h5, matches.h5 and pairs.txt, the input files of hloc.reconstruction.main.
 
         deepdetect export hloc photos/ -o hloc/
         deepdetect export hloc out/*.npz --images photos/ -o hloc/
@@ -146,10 +144,7 @@ def hloc(
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
-    """Return the path of the file that marks a folder as an earlier export.
-
-    Raise an OptionError if the folder has other files but not this one, unless `overwrite`.
-    """
+    """Return an export's marker file; if it is missing, only `overwrite` allows other files."""
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")
@@ -165,10 +160,9 @@ def _export(
     values: dict[str, Any],
     describe: bool = True,
 ) -> cli.Result:
-    """Read a collection, or compute it from a folder, and write it.
+    """Read a collection, or compute it from a folder of images, and write it to `output`.
 
-    The file `marker` stands for the whole output: its record names the inputs. `values` are options
-    of `SAVED`, `FOLDER` and `MAX_KEYPOINTS`.
+    The record of the file `marker` names the inputs of all output files.
     """
     named = [Path(values[name]) for name in ("matches", "pairs") if name in values]
     inputs = [*sources, *(path for path in named if path.exists())]

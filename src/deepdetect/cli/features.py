@@ -38,8 +38,7 @@ def extract(
     """Extract the keypoints and descriptors of all images below a folder.
 
     Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. Run the same command
-    again to resume after an interruption, or to update the file: it adds new and changed images,
-    and removes the features of deleted images.
+    again to resume, or to update the file for new, changed and deleted images.
 
         deepdetect extract photos/ -o features.h5
         deepdetect extract photos/ -o features.h5 --engine ray --workers 64
@@ -50,7 +49,7 @@ def extract(
     """
     file = cli.output_file(output, "features.h5")
     how = EXTRACTION.take(values)
-    chosen, selection = chosen_detector(  # each process gets a copy
+    chosen, selection = chosen_detector(  # one thread: each process gets a copy
         detector, values, options=DESCRIBED_POINTS, threads=1
     )
     report = extract_features(folder, file, chosen, selection=selection, quiet=False, **how)

@@ -78,9 +78,8 @@ def match(
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
     estimated geometry and its inliers, and a visualisation. The options --descriptor, --matcher,
-    --filter-by and --ratio are for --unguided.
-
-    Ends with exit code 3 if no geometry between the images can be trusted, or nothing matches.
+    --filter-by and --ratio are for --unguided. The exit code is 3 if nothing matches, or if no
+    geometry between the images can be trusted.
 
         deepdetect match left.jpg right.jpg
         deepdetect match page1.jpg page2.jpg --model homography --mutual
@@ -90,8 +89,7 @@ def match(
     Args:
         pairs: Which of more than two images to match: exhaustive (all pairs), sequential:1 (each
             image with the next by name), or a text file with the names of two images on each line.
-        unguided: Match by descriptors alone, over the whole image, and estimate a geometry from
-            these matches.
+        unguided: Match by descriptors alone over the whole image, then estimate a geometry.
         homography: Text file with a known 3x3 homography from the first image to the second.
             Matches that agree with it are the inliers.
         camera0: Text file with the 3x3 matrix of the first camera, for --model essential.
@@ -166,7 +164,6 @@ def _match_unguided(
     seed: int = 0,
     **values: Any,
 ) -> Matches:
-    """Match by descriptors alone, and estimate a geometry from these matches."""
     timer = StageTimer(progress)
     with timer.stage("keypoints"):
         chosen = {} if selection is None else vars(selection)
@@ -287,8 +284,7 @@ def register(
         deepdetect register ortho.tif drone.tif --bands 3 2 1 --extent union --apply-to thermal.tif
 
     Args:
-        apply_to: More images with the size and the view of the second image, such as a thermal
-            band. They are warped by the same homography.
+        apply_to: More images to warp, with the size and view of the second, such as thermal bands.
     """
     reference, folder = read_metadata(image0, placed=True), cli.output_folder(output)
     own = {path: read_metadata(path) for path in (image1, *apply_to)}
@@ -341,9 +337,8 @@ def stitch(
 ) -> cli.Result:
     """Stitch overlapping images, taken from one place or showing one plane, to a panorama.
 
-    The images may be in any order. Those that do not overlap with others, or cannot be read, are
-    left out and listed.
-    A flat panorama covers at most 100 to 120 degrees, a cylindrical or spherical one up to 360.
+    The images may be in any order. Images that overlap no other, or cannot be read, are left out
+    and listed. Flat panoramas cover at most 100 to 120 degrees, cylindrical or spherical ones 360.
 
         deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
         deepdetect stitch photos/ --projection cylindrical --crop -o panorama.jpg
@@ -388,7 +383,7 @@ def stitch(
                     progress=done,
                     **values,
                 )
-        except (OptionError, RegistrationError) as error:  # its message has indices, not names
+        except (OptionError, RegistrationError) as error:  # has indices in place of names
             text = str(error)
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))

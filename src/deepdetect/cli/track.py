@@ -38,9 +38,8 @@ def track(
 
     Writes a video that shows the points, their last positions and the frames processed per second,
     and a table of all tracks (.csv) with the columns frame, track, x, y and score. A recording of a
-    camera runs until Ctrl+C, SIGTERM or SIGHUP ends it; both files are then finished. Images of a
-    folder that cannot be read, or differ in size from the first one, are listed at the end, and the
-    exit code is 1.
+    camera runs until Ctrl+C, SIGTERM or SIGHUP ends it; both files are then finished. If images of
+    a folder cannot be read or differ in size, they are listed at the end, and the exit code is 1.
 
         deepdetect track drive.mp4 -o tracks.mp4
         deepdetect track frames/ -o tracks.mp4 --max-keypoints 500

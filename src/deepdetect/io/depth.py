@@ -13,8 +13,8 @@ from .._shared.records import save_arrays
 MAX_UINT16 = 65535
 
 HEADROOM = 4.0
-"""The scale of a PNG covers depths up to this many times their 99th percentile. If it also covered
-outliers beyond that, its steps would be coarse."""
+"""A PNG stores depths up to this many times their 99th percentile. If it also stored outliers
+beyond this limit, its depth steps would be coarse."""
 
 
 def save_depth_png(
@@ -23,9 +23,9 @@ def save_depth_png(
     """Write a depth map as a 16-bit grey PNG, atomically; return a summary of its content.
 
     A pixel is round(depth * value_per_unit), or 0 if the depth is unknown (not finite, 0 or less).
-    `value_per_unit` is `scale`. By default it is the finest of 1, 2 or 5 times a power of ten that
-    covers depths up to 4 times the 99th percentile. Larger depths are written as unknown, and the
-    summary counts them as `out_of_range`. The PNG has text chunks `unit` and `value_per_unit`.
+    `value_per_unit` is `scale`. By default it is the largest number 1, 2 or 5 times a power of ten
+    with which 16 bits cover all depths up to 4 times the 99th percentile. Other depths are written
+    as unknown and counted as `out_of_range`. The PNG has text chunks `unit` and `value_per_unit`.
     """
     known = np.isfinite(depth) & (depth > 0)
     scale = scale or _scale(depth[known])
@@ -54,14 +54,13 @@ def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarra
 
 
 def _scale(depths: np.ndarray) -> float:
-    """Choose the scale that covers all depths except outliers (see `HEADROOM`)."""
     if not len(depths):
         return 1.0
     return depth_scale(min(float(depths.max()), HEADROOM * float(np.percentile(depths, 99))))
 
 
 def depth_scale(furthest: float) -> float:
-    """Return the finest scale, 1, 2 or 5 times a power of ten, that fits a depth into 16 bits."""
+    """Return the largest scale, 1, 2 or 5 times a power of ten, that fits a depth into 16 bits."""
     finest = MAX_UINT16 / furthest
     power = 10.0 ** np.floor(np.log10(finest))
     return float(max(step * power for step in (1, 2, 5) if step * power <= finest * (1 + 1e-12)))

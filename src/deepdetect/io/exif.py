@@ -12,8 +12,7 @@ from ..geometry.camera import Calibration, Camera, Size
 from .image_file import file_name, is_file, open_image
 
 DIAGONAL_35MM_MM = float(np.hypot(36, 24))
-"""Diagonal of a 35 mm film frame in mm. The 35 mm equivalent focal length is defined by it
-(CIPA)."""
+"""Diagonal of a 35 mm film frame, which defines the 35 mm equivalent focal length (CIPA)."""
 
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Length in mm of the unit for each code of FocalPlaneResolutionUnit: inch and cm as in the
@@ -27,14 +26,14 @@ MAX_FOCAL_DIFFERENCE = 0.1
 but often wrong. It is used if the two differ by at most this fraction. Chosen by hand."""
 
 MAX_ASPECT_DIFFERENCE = 0.01
-"""A photograph counts as cropped if its aspect ratio differs from the one in its EXIF by more than
-this fraction. Chosen by hand."""
+"""If the aspect ratios of a photograph and of its EXIF differ by more than this fraction, the
+photograph counts as cropped. Chosen by hand."""
 
 ADVICE = "give `focal_px` or `calibration`"
 
 
 def calibration_from_exif(image0: Any, image1: Any, size0: Size, size1: Size) -> Calibration:
-    """Read a calibration from two photographs; arguments and errors as in `camera_from_exif`."""
+    """Read the calibration of two photographs; arguments and errors as in `camera_from_exif`."""
     left, right = camera_from_exif(image0, size0), camera_from_exif(image1, size1)
     return Calibration(left, right, source="EXIF")
 
@@ -43,8 +42,8 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
     """Read the camera of a photograph, which is a file or a PIL image, from its EXIF.
 
     `size` is (width, height) as `load_image` returns the photograph. The focal length is computed
-    from the tags FocalLength and sensor resolution if the result agrees with FocalLengthIn35mmFilm,
-    or that tag is missing; otherwise from FocalLengthIn35mmFilm.
+    from FocalLength and the sensor resolution. If these tags are missing, or the result disagrees
+    with FocalLengthIn35mmFilm, it is computed from FocalLengthIn35mmFilm.
 
     Raises:
         ReconstructionError: there is no usable focal length, or the photograph was cropped later.
@@ -82,10 +81,7 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 
 def _tags(image: Any) -> tuple[dict[int, Any], int]:
-    """Read the EXIF tags, and the orientation from which `load_image` turns a file upright.
-
-    The orientation is 1 for PIL images, which are not turned. Unreadable tags count as missing.
-    """
+    """Read the EXIF tags and orientation: 1 for PIL images, which `load_image` does not turn."""
     try:
         if hasattr(image, "getexif"):
             return dict(image.getexif().get_ifd(IFD.Exif)), 1

@@ -27,10 +27,9 @@ def write_glb(
 ) -> None:
     """Write the points in glTF's frame with their colours, 20 bytes per point.
 
-    With (M, 3) `faces`, indices of points, a triangle mesh is written.
-
     Colours are converted to linear values, as glTF requires. They have 16 bits, so that all 256
-    sRGB levels stay distinct. The asset's extras contain the metadata, the unit and the frame.
+    sRGB levels stay distinct. The asset's extras contain the metadata, the unit and the frame. If
+    `faces`, (M, 3) indices of points, are given, the points become a triangle mesh.
     """
     # A rotation about the x axis makes y point up: by 180 degrees for a camera's frame, and by 90
     # for a frame with z up. Units of unknown length are written as metres, and the extras say so.

@@ -61,7 +61,7 @@ def read_gps(path: Path) -> GpsFix | None:
     )
     below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01")
     altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if below_sea else 1)
-    # Older drones misspell it as Longtitude.
+    # Older drones write "Longtitude".
     east = drone.get("GpsLongitude", drone.get("GpsLongtitude", np.nan))
     if np.isfinite(east) and np.isfinite(north := drone.get("GpsLatitude", np.nan)):
         latitude, longitude = (north, east) if north or east else (latitude, longitude)
@@ -81,10 +81,7 @@ def read_gps(path: Path) -> GpsFix | None:
 
 
 def _gravity(drone: dict[str, float]) -> np.ndarray | None:
-    """Return the unit vector towards the ground in the camera's frame; None if unknown.
-
-    It is computed from roll and pitch of the gimbal in degrees. A pitch of 0 is level, -90 is down.
-    """
+    """Compute `GpsFix.gravity` from roll and pitch of the gimbal in degrees; pitch -90 is down."""
     angles = drone.get("GimbalPitchDegree", np.nan), drone.get("GimbalRollDegree", np.nan)
     if not max(map(abs, angles)) <= MAX_GRAVITY_TILT_DEG:
         return None
@@ -93,10 +90,7 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 
 def _degrees(value: Any, sign: Any, below: str) -> float:
-    """Convert degrees, minutes and seconds to degrees, negative if `sign` is `below` (S or W).
-
-    Any other value becomes NaN.
-    """
+    """Convert degrees, minutes, seconds to degrees: < 0 if `sign` is `below`, NaN if invalid."""
     try:
         degrees, minutes, seconds = (_number(part) for part in value)
     except (TypeError, ValueError):

@@ -25,11 +25,11 @@ DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
 Chosen by hand."""
 
 MAX_LEVEL = 65535
-"""Positions are stored as whole numbers from 0 to this one along each axis, in 16 bits."""
+"""Positions along each axis are stored as integers from 0 to this number, in 16 bits."""
 
 MARGIN = 1.0
-"""Points farther outside the robust box than this times its size are left out, because a few very
-distant points would make the quantisation steps coarse for all. Chosen by hand."""
+"""Points are left out if they lie outside the robust box by more than this times its size, because
+a few distant points would make the quantisation steps coarse. Chosen by hand."""
 
 CAMERA_SIZE = 0.35
 """A camera is drawn as a pyramid. Its depth is this fraction of the median distance from a camera
@@ -46,8 +46,8 @@ OVERVIEW_POINTS = 2000
 class PagePoints:
     """Points as the page stores them: (N, 3) uint16 levels and (N, 3) uint8 colours.
 
-    The position of a point is offset + levels * step, with an offset and a step (3,) for each axis.
-    `left_out` is the number of points that are not stored because they are too far away.
+    The positions of the points are `offset + levels * step`, where `offset` and `step` have shape
+    (3,). `left_out` is the number of points that are too far away to be stored.
     """
 
     levels: np.ndarray
@@ -148,7 +148,7 @@ def _description(
 def _overview(
     cloud: PointCloud, box: RobustBox, lines: np.ndarray, slope: float
 ) -> dict[str, object]:
-    """Return the closest view, from behind and above, that shows the cloud and all cameras."""
+    """Return the closest view from behind and above the cameras that shows them and the cloud."""
     inside = ((cloud.points >= box.low) & (cloud.points <= box.high)).all(axis=1)
     near = cloud.points[inside][:: max(1, int(inside.sum()) // OVERVIEW_POINTS)]
     shown = np.concatenate([near.astype(np.float64), lines])
@@ -169,10 +169,7 @@ def _overview(
 
 
 def _largest_slope(cloud: PointCloud) -> float:
-    """Return the tangent of half the field of view in which a camera at the origin sees the cloud.
-
-    It shows 99% of the points in front of the camera, unless `SLOPES` limits it.
-    """
+    """Return the slope (see `SLOPES`) at which a camera at the origin sees 99% of the points."""
     before = cloud.points[cloud.points[:, 2] > 0].astype(np.float64)
     if not len(before):
         return DEFAULT_SLOPE

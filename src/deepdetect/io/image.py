@@ -39,13 +39,11 @@ MINIMUM_SIDE = 16
 
 ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26
-"""A PNG file states its bit depth and its colour type within this many first bytes. `GREY_PNG` is
-the colour type of grey without alpha."""
+"""A PNG file states its bit depth and colour type (`GREY_PNG`: grey) in this many first bytes."""
 GREY_PNG = 0
 
 STRIP_PIXELS = 1 << 20
-"""PIL images are converted in strips of about this many pixels, because copies of a whole large
-image take gigabytes."""
+"""PIL images are converted in strips of this size, since copies of a large image take gigabytes."""
 
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda image: cv2.flip(image, 1),
@@ -56,7 +54,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: cv2.flip(cv2.transpose(image), -1),
     8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
 }
-"""Each EXIF orientation from 2 on has a function here that turns an image upright."""
+"""Functions that turn an image upright, by the EXIF orientation of the image."""
 
 
 @suggest_keywords
@@ -136,7 +134,7 @@ def _load(
     *,
     deep: bool = False,
     raw: bool = False,
-    **for_arrays: Any,  # options of the call; those of a command apply to files only
+    **for_arrays: Any,  # options of this call; those of a command do not apply to arrays
 ) -> np.ndarray:
     if is_file(image):
         rgb = _read_file(image, options, deep, raw)
@@ -178,7 +176,7 @@ def batch_length(images: Images) -> int:
 
 @contextmanager
 def image_named(number: int) -> Iterator[None]:
-    """Add the image's index in its list to the messages of errors that the block raises."""
+    """Prefix messages of errors that the block raises with the index of the image in its list."""
     try:
         yield
     except (ImageError, OptionError) as error:
@@ -214,7 +212,7 @@ def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """List the image files below a folder in natural order: "2.png" comes before "10.png".
 
-    Visualisations that commands of this package have written there are left out.
+    Images that commands of this package have written into the folder are left out.
 
     Raises:
         ImageError: the folder is missing, is a file, or has no image outside of `exclude`.
@@ -251,8 +249,8 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
 def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str, Path]:
     """Return a dictionary of the given image files and those below the given folders, by name.
 
-    The name of an image is its path relative to the given folder; for a given file it is the file
-    name. If two names would be the same, all are relative to the common parent folder.
+    A given file has its file name, other images have their path relative to the given folder. If
+    two names would be the same, all names are paths relative to the common parent folder.
     """
     names: dict[Path, Path] = {}
     for path in paths:
@@ -280,7 +278,7 @@ def _read_file(
                 else:
                     rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
                 orientation = orientation_of(image)
-            del image  # frees its pixels before turning makes another copy
+            del image  # frees its pixels before `UPRIGHT` makes another copy
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 

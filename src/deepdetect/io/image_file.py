@@ -49,8 +49,7 @@ FORMATS = {
     "JXL": ".jxl",  # likewise
     "TGA": ".tga",  # has no signature, so it comes last
 }
-"""Formats that are read, with their suffixes. All are decoded in this process. EPS is missing
-because decoding it would start Ghostscript."""
+"""Formats that are read, with their suffixes. EPS is not, because it would start Ghostscript."""
 
 _RAW = ".dng .cr2 .cr3 .crw .nef .nrw .arw .sr2 .srf .raf .orf .rw2 .pef .srw .3fr .iiq .erf"
 RAW_SUFFIXES = tuple(f"{_RAW} .mrw .kdc .dcr .mos .mef .x3f .rwl".split())
@@ -63,8 +62,7 @@ UNREAD = {
     b"\x93NUMPY": ("a NumPy array", ""),
     b"DICM": ("a DICOM image", ".dcm"),
 }
-"""These formats are not read, since their value range is undefined; the error names them. For each
-format there are its first bytes, name and suffixes."""
+"""Signatures, names and suffixes of formats that are rejected: their value range is undefined."""
 
 _OTHERS = (suffixes for _, suffixes in UNREAD.values())
 IMAGE_SUFFIXES = (*" ".join([*FORMATS.values(), *_OTHERS]).split(), *RAW_SUFFIXES)
@@ -74,11 +72,10 @@ MAX_MEGAPIXELS = 200.0
 """Images with more megapixels are rejected by default. The largest phone sensors have 200."""
 
 SIGNATURE_BYTES = 132
-"""Formats are recognised by this many first bytes, because DICOM's signature is in bytes 128 to
-131."""
+"""Formats are recognised by this many first bytes: DICOM's signature is in bytes 128 to 131."""
 
 STANDARD_INPUT = "/dev/stdin"
-"""This path means standard input on every system. Commands also accept "-"."""
+"""This path means standard input on every system. For commands, "-" does so as well."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -141,8 +138,7 @@ _reading: ContextVar[ReadingOptions] = ContextVar("reading", default=_USUAL)
 def read_with(options: ReadingOptions) -> Iterator[None]:
     """Read image files with these options in the block, unless a call has options of its own.
 
-    Commands use this, because the functions between a command and the reading of an image do not
-    pass reading options on. Other processes are not affected.
+    Commands use this for all images that they read. Other processes are not affected.
     """
     token = _reading.set(options)
     try:
@@ -152,7 +148,7 @@ def read_with(options: ReadingOptions) -> Iterator[None]:
 
 
 def reading_options(**given: Any) -> ReadingOptions:
-    """Return the options that `read_with` set, with those replaced that are given and not None."""
+    """Return the options that `read_with` set, but with the given values that are not None."""
     return replace(_reading.get(), **{n: value for n, value in given.items() if value is not None})
 
 
@@ -163,8 +159,8 @@ def open_image(
     """Open an image file as a PIL image; its pixels are decoded when it is loaded.
 
     The source is a path, the content of a file as bytes, or a binary file, which is read from its
-    beginning and stays open. Pillow's errors in the block become those below. In their messages
-    `what` stands for the name of an image without a path.
+    beginning and stays open. Errors of Pillow in the block become those below. Messages call an
+    image without a path "the", followed by `what`.
 
     Raises:
         ImageError: the file is missing, truncated, damaged (where the format allows to detect it),
@@ -255,7 +251,7 @@ def damaged_image(name: str, error: Exception | str) -> ImageError:
 
 @contextmanager
 def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
-    """Open a path or bytes; rewind an open file, or read all of it if it cannot be rewound."""
+    """Open a path or bytes; rewind an open file, or copy it to memory if it cannot be rewound."""
     if isinstance(source, (bytes, bytearray)):
         yield io.BytesIO(source)
     elif name == STANDARD_INPUT:
@@ -280,7 +276,7 @@ def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
 
 @functools.cache
 def _standard_input() -> bytes:
-    """Return the content of standard input, which can be read only once, from a cache."""
+    """Return the content of standard input; it is cached because it can be read only once."""
     if sys.stdin is None:
         raise ImageError("there is no standard input: give the file")
     return sys.stdin.buffer.read()

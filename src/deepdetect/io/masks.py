@@ -34,9 +34,8 @@ def encode_mask(mask: np.ndarray) -> bytes:
 def load_mask(source: Any) -> np.ndarray:
     """Read a mask of any bit depth as (H, W) bool: True where a pixel is brighter than mid-grey.
 
-    White is the smallest of `WHITES` that no pixel exceeds, or the largest pixel value if there is
-    none. The mask is turned upright, as in `load_image`. Arguments and errors are those of
-    `open_image`.
+    White is the smallest of `WHITES` that no pixel exceeds, or else the largest pixel value. Masks
+    are turned upright, as in `load_image`. Arguments and errors are those of `open_image`.
     """
     with open_image(source, what="mask") as opened:
         deep = opened.mode.startswith("I")  # 16 or 32 bits per pixel

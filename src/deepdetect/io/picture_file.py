@@ -31,8 +31,8 @@ PLACED_FORMATS = ("TIFF", "JPEG", "PNG", "JPEG2000", "BMP", "GIF")
 """Pillow's names of formats whose georeference GDAL can read."""
 
 FIRST_CENTRE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-"""Matrix from pixel coordinates of this package, where (0, 0) is the centre of the first pixel, to
-those of GDAL, where (0, 0) is the top left corner of that pixel."""
+"""This matrix maps the package's pixel coordinates, whose origin is the centre of the first pixel,
+to GDAL's, whose origin is the top left corner of that pixel."""
 
 ICC_PROFILE = 34675
 
@@ -78,7 +78,7 @@ class Metadata:
     plain: bool = True
 
     def moved(self, matrix: np.ndarray | None) -> Metadata:
-        """Return the metadata of the image warped by an affine (3, 3) matrix."""
+        """Return the metadata after a warp by an affine (3, 3) matrix; None: an unknown warp."""
         if self.to_world is None or matrix is None:
             return replace(self, to_world=None, crs=None)
         return replace(self, to_world=self.to_world @ np.linalg.inv(matrix / matrix[2, 2]))
@@ -124,7 +124,7 @@ class Metadata:
         height, width = picture.shape[:2]
         fine = self.exif.get_ifd(IFD.Exif)
         size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
-        if size != (width, height):  # this tag applies to the whole frame only
+        if size != (width, height):  # the tag applies only to the whole frame
             fine.pop(Base.FocalLengthIn35mmFilm, None)
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1
@@ -171,7 +171,7 @@ class Metadata:
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
-    """Return whether there are EXIF values, and Pillow can write them; some it can only read."""
+    """Return whether there are EXIF values, all of which Pillow can write; it only reads some."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     directory = ImageFileDirectory_v2()
@@ -220,7 +220,7 @@ def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
         kept = _kept_exif(exif) if kind == "TIFF" else exif
         found = replace(found, exif=kept if len(kept) else None)
         orientation = exif.get(Base.Orientation, 1)
-    # The georeference applies to the image as it is stored, not turned upright.
+    # The georeference applies to the stored image, before it is turned upright.
     if placed and path is not None and kind in PLACED_FORMATS and orientation == 1:
         found = replace(found, **_read_place(path, page))
     return found
@@ -288,10 +288,7 @@ def _of_tiff(file: Any) -> tuple[Metadata, Any]:
 
 
 def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
-    """Write a (H, W, 3) uint8 or uint16 RGB image as .png, .tif or (with 8 bits) .jpg, atomically.
-
-    The metadata are written into the file.
-    """
+    """Write (H, W, 3) uint8 or uint16 RGB with its metadata as .png, .tif or .jpg, atomically."""
     suffix = picture_suffix(path)
     if suffix.startswith(".tif"):
         metadata.write_tiff(rgb, Path(path))

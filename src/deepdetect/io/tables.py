@@ -96,8 +96,7 @@ def save_matches(matches: Matches, path: str | Path) -> None:
             `keypoint_scores0` (N,) float32 and `image_size0` (width, height); the names for the
             second image end in 1. If there is a geometry, the file has the strings `model`, `scene`
             and `confidence`, the (3, 3) `matrix` (if unknown, an empty (0, 0) array), and the
-            numbers of `Evidence`.
-            A CSV file has the columns x0, y0, x1, y1, score, inlier.
+            numbers of `Evidence`. A CSV file has the columns x0, y0, x1, y1, score, inlier.
 
     Raises:
         OptionError: the path has another ending.
@@ -153,10 +152,7 @@ def load_matches(path: str | Path) -> Matches:
 
 @contextmanager
 def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
-    """Yield the arrays of an npz file by name; arrays without dimensions become numbers or strings.
-
-    Errors, also those that the block raises, name the file and its expected content.
-    """
+    """Yield the values of an npz file by name; all errors in the block name the file."""
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             yield {name: _value(array) for name, array in arrays.items()}

@@ -1,6 +1,6 @@
 """Reading TIFF files: the choice of the page, and the conversion of its values to RGB.
 
-Each tag that changes the meaning of pixels is respected, or the error names it.
+If a tag changes the meaning of pixels, the tag is respected, or an error names it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MOSAICS = (32803, 34892)
 """Photometric interpretations of raw photographs: a colour filter array, and linear raw."""
 
 JPEG = (6, 7)
-"""Codes of JPEG compression, the only one for which YCbCr is read."""
+"""Codes of JPEG compression, the only compression with which YCbCr is read."""
 
 ALPHA = (1, 2)
 """Types of extra samples that are alpha and not a band."""
@@ -34,8 +34,7 @@ ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
 MAX_BYTES_PER_PIXEL = 256
-"""Files with more bytes per pixel are rejected, since a small file can claim to have any number of
-bands."""
+"""Files with more bytes per pixel are rejected, since small files can claim any number of bands."""
 
 
 def read_tiff(
@@ -179,18 +178,14 @@ def _white(page: Any) -> int | None:
         return (1 << bits) - 1
     values = np.atleast_1d(page.tags.valueof(MAX_SAMPLE_VALUE, 0))
     largest = int(values.max())
-    # The standard says that the tag holds the largest value of a pixel, which need not be white.
-    # If it is 2^n - 1, though, it is taken for the value of white.
+    # The tag holds the largest value of a pixel, which is taken for white only if it is 2^n - 1.
     return largest if largest > 255 and not largest & (largest + 1) else None
 
 
 def _read_by_pillow(
     file: BinaryIO, stored: list[Any], page: Any, name: str, options: ReadingOptions
 ) -> np.ndarray:
-    """Decode with Pillow a page that tifffile could only decode if imagecodecs were installed.
-
-    Raise a MissingExtraError if Pillow cannot decode it correctly.
-    """
+    """Decode with Pillow, if it does so correctly, a page for which tifffile needs imagecodecs."""
     bits, photometric = page.bitspersample, int(page.photometric)
     plain = page.dtype.kind in ("b", "u") and (
         bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)

@@ -1,8 +1,7 @@
-"""Finding patches of one image in later images, with an affine deformation, by Gauss-Newton.
+"""Finding patches of one image in later images, under an affine deformation, by Gauss-Newton.
 
-The method is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004):
-everything but the residuals is computed once for each patch. Gain and offset of the brightness are
-eliminated.
+The method is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004): each
+iteration computes only the residuals anew. Gain and offset of the brightness are eliminated.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ import numpy as np
 from .._shared.opencv import cv2
 
 RADIUS_PX = 10
-"""A patch is a square that reaches this far from its central pixel. Its pixels have Gaussian
-weights whose sigma is half of this. Chosen by hand."""
+"""A patch is a square that extends this far from its central pixel. Its pixels have Gaussian
+weights with half of this distance as sigma. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
 """Images are blurred with this sigma, so that values between pixels can be interpolated well."""
 
 BORDER_PX = 3
-"""A border of this width is not used, because its blurred values depend on padding."""
+"""An image border of this width is not used, because blurred values there depend on padding."""
 
 MAX_ITERATIONS = 30
 CONVERGENCE_PX = 0.03
@@ -30,24 +29,22 @@ CONVERGENCE_PX = 0.03
 help, because OpenCV 4 interpolates images at steps of 1/32 px."""
 
 MAX_SHIFT_PX = 3.0
-"""A patch is searched up to this distance from its expected position. Expected positions come from
-tracking by translation alone, which can be wrong by that much where surfaces come nearer. Chosen by
-hand."""
+"""A patch is searched up to this distance from its expected position, because tracking by
+translation alone can be wrong by that much where surfaces come nearer. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
 """A patch counts as found if its correlation with the image is at least this. Chosen by hand."""
 
 MAX_GROWTH = 4.0
-"""The area of a patch may grow or shrink by this factor. If it changes more, one of the images
-shows too few of its pixels. Chosen by hand."""
+"""The area of a patch may grow or shrink by at most this factor, because otherwise one image shows
+the patch on too few pixels. Chosen by hand."""
 
 RIDGE = 1e-4
 """This fraction of the scale of the normal equations is added to their diagonal, because they are
 singular for a patch that shows only parallel edges. Chosen by hand."""
 
 MOST_READ = 1 << 14
-"""Patches are read in groups of at most this many, since OpenCV limits the sides of an image to
-32,767."""
+"""OpenCV limits the sides of images to 32,767 px, so at most this many patches are read at once."""
 
 
 class Patches(NamedTuple):
@@ -55,7 +52,7 @@ class Patches(NamedTuple):
 
     The steps of a patch map its P residuals to changes of its position (2 numbers) and of its
     deformation (4 numbers, row by row). `affinities` (N, 2, 2) float64 map offsets of pixels from
-    the centre of a patch to offsets in the image in which it was found last.
+    the centre of a patch to offsets in the image in which the patch was last found.
     """
 
     values: np.ndarray
@@ -72,14 +69,14 @@ class Patches(NamedTuple):
         return cls(values, steps, np.empty(0, np.float32), np.empty((0, 2, 2)))
 
     def select(self, rows: np.ndarray) -> Patches:
-        """Return some of the patches; `rows` is a mask or indices."""
+        """Return some of the patches; `rows` is a boolean mask or indices."""
         return Patches(*(each[rows] for each in self))
 
 
 def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
     """Return patches around (N, 2) points of a blurred image.
 
-    Patches too near to the border of the image are all zero, and so are never found.
+    The values of patches too near to the image border are 0, so these patches are never found.
     """
     offsets, weights = _pixels()
     affinities = np.tile(np.eye(2), (len(xy), 1, 1))
@@ -151,11 +148,8 @@ def _pixels() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
-    """Return the (N, P) values of an image at the pixels of N patches warped by the affinities.
-
-    Values are interpolated with the Lanczos kernel, because OpenCV's cubic kernel shifts them by up
-    to 0.05 px.
-    """
+    """Return the (N, P) values of an image at the pixels of N patches warped by the affinities."""
+    # Lanczos interpolation is used, because OpenCV's cubic kernel shifts by up to 0.05 px.
     places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ _pixels()[0]
     parts = np.array_split(places, len(places) // MOST_READ + 1)
     return np.concatenate(

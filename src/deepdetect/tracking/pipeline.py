@@ -25,8 +25,7 @@ from .tracks import TrackDrawer, TrackedFrame, write_tracks
 from .video import Frame, FrameSource, check_video_name, write_video
 
 MIN_SIDE_PX = 32
-"""`max_side`, the length of the longer side of scaled frames, must be at least this. Chosen by
-hand."""
+"""`max_side`, the longer side of scaled frames, must be at least this. Chosen by hand."""
 
 RATE_FRAMES = 10
 """The displayed frame rate is a mean over this number of frames."""
@@ -73,8 +72,7 @@ def track_frames(
     Args:
         source: a source that was opened in a `with` block.
         tracker: a new tracker.
-        max_side: frames whose longer side has more pixels than this are scaled down to it for the
-            tracker. None: frames are not scaled.
+        max_side: larger frames are scaled for the tracker to this longer side. None: no scaling.
 
     Returns:
         Iterator over pairs of a frame, (H, W, 3) uint8 RGB, and its tracks. Positions are in pixels
@@ -124,14 +122,12 @@ def track(
         source: a video file, a folder of images, or the number of a camera.
         output: video ending in .mp4, .mov, .mkv or .avi; the CSV file next to it has the columns
             frame, track, x, y and score. If it ends in .csv, no video is written.
-        detector: detector of the points. None: a `PointDetector` that finds `CANDIDATES` times as
-            many points as tracks are wanted.
+        detector: detector of points. None: a `PointDetector` of `CANDIDATES` points per track.
         options: how points are followed.
         every: process every N-th frame.
         max_frames: largest number of frames that are taken. None: all.
-        max_side: frames whose longer side has more pixels than this are scaled down to it for the
-            tracking only. None: no limit.
-        tail: number of positions of a track that are drawn: the last ones.
+        max_side: for the tracking only, scale larger frames to this longer side. None: no limit.
+        tail: number of positions that are drawn of each track: the latest ones.
         quiet: show no progress bar.
 
     Returns:
@@ -189,7 +185,7 @@ def track(
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:
-    """Return the paths of the video, or None if none is written, and of the CSV file."""
+    """Return the paths of the video (None if `output` ends in .csv) and of the CSV file."""
     path = Path(output)
     if path.suffix.lower() == ".csv":
         return None, path
@@ -199,10 +195,9 @@ def output_files(output: str | Path) -> tuple[Path | None, Path]:
 
 @contextmanager
 def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether a signal has asked to end the recording of a live source.
+    """Yield a function that tells whether a signal has asked to end the recording of a camera.
 
-    The first Ctrl-C, SIGTERM or SIGHUP is only noted, so that the files are finished. A second one
-    ends the process at once, and leaves no file.
+    The first signal is only noted, so that the files are finished. A second one ends the process.
     """
     noted: list[int] = []
     with ExitStack() as handlers:

@@ -2,7 +2,7 @@
 
 Lucas and Kanade, "An iterative image registration technique", 1981, with Bouguet's pyramid. Each
 point is followed to the next frame and back, and dropped if it does not come back to where it was
-(Kalal et al., "Forward-backward error", 2010). The others are aligned with the patch around their
+(Kalal et al., "Forward-backward error", 2010). Kept points are aligned with the patch around their
 first position, under an affine deformation, so that errors hardly add up (Shi and Tomasi, "Good
 features to track", 1994). The best keypoints that are far enough from all tracks begin new tracks.
 """
@@ -27,24 +27,21 @@ from .alignment import BLUR_SIGMA_PX, Patches, cut_patches, find_patches
 from .tracks import TrackedFrame
 
 Detect = Callable[[np.ndarray], Keypoints]
-"""Function that returns the keypoints of a (H, W, 3) uint8 RGB image."""
+"""A function that returns the keypoints of a (H, W, 3) uint8 RGB image."""
 
 CANDIDATES = 3
-"""The default detector finds this many keypoints for each track that is wanted, so that enough of
-them are far from existing tracks and from each other."""
+"""The detector finds this many keypoints per track, so that enough are far from existing tracks."""
 
 MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
-"""A new point keeps a distance from all tracks: at least the first number, in pixels, and at least
-the second number times the spacing that a grid of `max_keypoints` points over the image would have.
-Points all over the image tell more about the motion of the camera."""
+"""A new point keeps the larger of two distances from all tracks: the first number in pixels, or the
+second times the spacing of a grid of `max_keypoints`, so that points cover the whole image."""
 
 WINDOW_PX, LEVELS = 21, 3
-"""The first is the side of the patch that is followed. The second is the number of pyramid levels
-above the image; each level doubles how far points may move between frames. Both numbers are
-OpenCV's defaults."""
+"""Side of the patch that is followed, and number of pyramid levels above the image. Each level
+doubles how far points may move between frames. Both numbers are OpenCV's defaults."""
 
 BORDER_PX = 2.0
-"""Points nearer to the border of the image are dropped. Chosen by hand."""
+"""Points nearer than this to the image border are dropped. Chosen by hand."""
 
 
 @suggest_keywords
@@ -55,10 +52,10 @@ class TrackingOptions:
     Attributes:
         max_keypoints: largest number of tracks at a time.
         detect_every: detect new points after this many frames, or earlier if many tracks are lost.
-        min_kept: detect new points early if less than this fraction is left of the tracks that
-            there were after the last detection.
-        max_return_error_px: drop a point if, followed to the next frame and back, it ends farther
-            than this from where it was, in pixels.
+        min_kept: detect new points early if less than this fraction of the tracks after the last
+            detection is left.
+        max_return_error_px: drop a point if, followed to the next frame and back, it ends more
+            than this many pixels from its start.
 
     Raises:
         OptionError: a value is out of its range.
@@ -206,9 +203,8 @@ def free_keypoints(
 ) -> np.ndarray:
     """Choose up to `count` keypoints, best first, that are far from tracks and from each other.
 
-    `taken` are the (M, 2) positions of the tracks. Returns the (K,) indices of the chosen
-    keypoints. Positions are rounded to whole pixels before their distance is compared with
-    `distance_px`.
+    `taken` are the (M, 2) positions of the tracks. Returns the (K,) indices of the keypoints.
+    Distances are measured between positions that are rounded to whole pixels.
     """
     width, height = keypoints.image_size
     radius = int(distance_px)

@@ -19,8 +19,8 @@ from ..viz.draw import line_scale
 HEADER = "frame,track,x,y,score"
 
 HUE_STEP = 0.61803
-"""The hue advances by this fraction of the colour circle from one track to the next. With the
-golden ratio, tracks with successive numbers get clearly different colours."""
+"""The hue advances by this fraction of the colour circle from each track to the next: the golden
+ratio, which gives successive tracks clearly different colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,10 @@ class TrackedFrame:
 
     Attributes:
         number: number of the frame in the source, from 0 on.
-        tracks: (N,) int64 numbers of the tracks, ascending; a track has the same number in all
-            frames.
+        tracks: (N,) int64 track numbers, ascending; a track keeps its number in all frames.
         xy: (N, 2) float32 positions in pixels; the centre of the first pixel is (0, 0).
         scores: (N,) float32 scores of the keypoints with which the tracks began.
-        ages: (N,) int64 number of frames since each track began, 0 if it begins here.
+        ages: (N,) int64 numbers of frames since each track began; 0: it begins in this frame.
 
     Raises:
         OptionError: the arrays do not have one row for each track.
@@ -59,7 +58,7 @@ class TrackedFrame:
 
 @contextmanager
 def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
-    """Open a CSV file of tracks, which appears, complete, only if the block ends without an error.
+    """Open a CSV file of tracks; the file appears only if the block ends without an error.
 
     The block gets a function that writes the rows of a frame: frame, track, x, y and score.
     """
@@ -156,6 +155,6 @@ class TrackDrawer:
 
 
 def track_color(track: int) -> tuple[int, int, int]:
-    """Return the RGB colour of a track, which is bright and the same in all frames."""
+    """Return the RGB colour of a track number; it is bright."""
     red, green, blue = colorsys.hsv_to_rgb(track * HUE_STEP % 1, 0.8, 1.0)
     return round(255 * red), round(255 * green), round(255 * blue)

@@ -29,8 +29,7 @@ FOLDER_FPS = 10.0
 """This rate, in frames per second, is assumed for folders and for videos that state no rate."""
 
 MAX_FPS = 1000.0
-"""If a file states more frames per second than this, its rate is wrong, and `FOLDER_FPS` is used.
-Chosen by hand."""
+"""If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
@@ -61,11 +60,9 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
     Attributes:
         live: whether the source is a camera, which has no end.
-        fps: frames per second of the frames that are taken: the source's rate divided by `every`.
-        count: number of frames that will be taken if the file states its length correctly; None if
-            unknown.
-        failures: a sentence on each image of a folder that has been left out so far, because it
-            cannot be read or differs in size from the first one.
+        fps: frame rate of the frames that are taken: the source's rate divided by `every`.
+        count: number of frames to take if the file states its length correctly; None if unknown.
+        failures: a sentence on each image that was unreadable, or differed in size from the first.
 
     Raises:
         MissingFileError: there is no such file, folder or camera.
@@ -167,7 +164,7 @@ def _camera_number(source: str | Path | int) -> int | None:
 
 
 def count_frames(path: Path) -> int:
-    """Return the number of frames of a video file that can be read in sequence."""
+    """Return how many frames of a video file can be read, one after the other, from its start."""
     backend, settings = cv2.CAP_ANY, []
     if cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends():
         # FFmpeg can leave frames undecoded, which needs only a fiftieth of the time.
@@ -188,7 +185,7 @@ def check_video_name(path: str | Path) -> str:
 
 @contextmanager
 def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Open a video file, which appears, complete, only if the block ends without an error.
+    """Open a video file; the file appears only if the block ends without an error.
 
     The block gets a function that writes a (H, W, 3) uint8 RGB frame; all frames must have the same
     size. The finished file is checked, because OpenCV does not report frames that it cannot write.

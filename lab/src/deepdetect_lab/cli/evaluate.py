@@ -159,7 +159,7 @@ def compare_clouds(
 
     Prints how much of the images each cloud covers, and how much its depths differ from those of
     model.ply. The clouds must be in the coordinate frame of the model, so run OpenMVS or COLMAP on
-    its sparse/0.
+    the model's sparse/0.
 
         deepdetect dev compare-clouds model/ openmvs/scene_dense.ply colmap/fused.ply
     """
@@ -197,14 +197,13 @@ def benchmark(
     Args:
         data: Folder of the data sets.
         output: Folder for the report.
-        protocol: Protocol: paper, standard, guided or degraded; may be repeated.
+        protocol: Any of paper, standard, guided, degraded; may be repeated.
             [default: all except degraded]
         method: A further method: NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
         baselines: Classical methods, separated by commas, or none. [default: all]
         preset: "published" gives the network BGR images, as the paper's code does; "default" RGB.
         cache: Folder for cached results.  [default: the folder cache in the output]
-        geometry_weights: Name or file of the weights that match stereo pairs; may be repeated.
-            [default: dense]
+        geometry_weights: Weights (name, file) for stereo pairs; may be repeated. [default: dense]
     """
     output = cli.output_folder(output)
     if values.get("resolution") not in (None, "auto", "native"):

@@ -84,7 +84,7 @@ FILTER_RUN = replace(PAIRS_RUN, common="validation")
 def chosen_label_settings(
     detectors: str | None = None, label_settings: str | None = None
 ) -> LabelOptions:
-    """Find label settings by name or TOML file, and replace the detectors if others are given.
+    """Return label settings by name or TOML file; `detectors` replace the detectors in them.
 
     Args:
         detectors: Detectors, separated by commas: sift, orb, brisk, fast, agast, harris,
@@ -108,9 +108,9 @@ def chosen_recipe(
     """Return a preset's training options with the given values changed.
 
     Args:
-        preset: Recipe, whose values other options override: default (its values are shown here),
-            dense (normal light only, denser labels), espnet (trains ESPNet), or paper (trains
-            ESPNet as in the paper).
+        preset: Recipe: default (its values are shown here), dense (normal light only, denser
+            labels), espnet (trains ESPNet), or paper (trains ESPNet as in the paper); other options
+            override its values.
     """
     if "stages" in values:
         values["stages"] = tuple(map(Stage.parse, values["stages"]))
@@ -118,7 +118,7 @@ def chosen_recipe(
     labels = chosen_label_settings(detectors, label_settings)
     if label_settings is not None:
         values["labels"] = labels
-    elif detectors is not None:  # keep the preset's settings for these
+    elif detectors is not None:  # keeps the preset's settings of these
         values["labels"] = recipe.labels.with_detectors(labels.detectors)
     return replace(recipe, **values)
 
@@ -138,10 +138,9 @@ def train(
 ) -> cli.Result:
     """Train the network on the images, or the shards, in a folder.
 
-    First, labels are made once by the detectors of `deepdetect label`. The output folder gets the
-    weights with the lowest validation loss (best.safetensors and deepdetect.onnx), the loss curves
-    (curves.csv and curves.png), and checkpoint.safetensors, from which the same command resumes an
-    interrupted run.
+    First, the detectors of `deepdetect label` make the labels. The output folder gets the weights
+    with the lowest validation loss (best.safetensors, deepdetect.onnx), the loss curves
+    (curves.csv, curves.png), and checkpoint.safetensors, from which the command resumes.
 
         deepdetect train photos/ -o run
         deepdetect detect photo.jpg --weights run/deepdetect.onnx
@@ -186,9 +185,8 @@ def _train_on_pairs(
 def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the ranker of keypoints on the images in a folder.
 
-    Pairs of synthetic views are generated from single images, so no labels are needed. The output
-    folder gets best.npz, MODEL_CARD.md, the curves and a checkpoint. Run the same command again to
-    resume an interrupted run.
+    Needs no labels: it makes pairs of synthetic views from single images. Writes best.npz,
+    MODEL_CARD.md, training curves, and a checkpoint from which the same command resumes.
 
         deepdetect dev train-points photos/train --validation photos/val -o run
 
@@ -202,9 +200,9 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
 def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the learned descriptor of keypoints on the images in a folder.
 
-    Pairs of synthetic views are generated from single images, so no labels are needed. The output
-    folder gets descriptor.onnx, descriptor.safetensors, MODEL_CARD.md, the curves and a checkpoint.
-    Run the same command again to resume an interrupted run.
+    Needs no labels: it makes pairs of synthetic views from single images. Writes descriptor.onnx,
+    descriptor.safetensors, MODEL_CARD.md, training curves, and a checkpoint from which the same
+    command resumes an interrupted run.
 
         deepdetect train-descriptor photos/train --validation photos/val -o run
 
@@ -218,9 +216,9 @@ def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) ->
 def train_match_filter(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the network that separates correct matches from wrong ones by their neighbours.
 
-    Pairs of synthetic views are generated from single images. The output folder gets
-    match_filter.onnx, match_filter.safetensors, MODEL_CARD.md, the curves and a checkpoint. Run the
-    same command again to resume an interrupted run.
+    Needs no labels: it makes pairs of synthetic views from single images. Writes match_filter.onnx,
+    match_filter.safetensors, MODEL_CARD.md, training curves, and a checkpoint from which the same
+    command resumes an interrupted run.
 
         deepdetect dev train-match-filter photos/train --validation photos/val -o run
 
@@ -235,8 +233,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """Pack the images in a folder with their labels into tar files.
 
     The files have WebDataset's layout. Training reads a few of them at a time, so they may be on a
-    slow disk or a network drive. Give `train` the same options as this command. Run the same
-    command again to resume after an interruption.
+    slow disk or a network drive. Give `train` the same options. To resume, run the command again.
 
         deepdetect dev shards --preset paper data/coco -o data/shards
         deepdetect train --preset paper data/shards -o run
@@ -280,8 +277,7 @@ def label(
 
     Args:
         output: Folder for the masks.
-        visualize: Also write STEM_labels.png: image, keypoint mask, edge mask and both combined, as
-            in the paper's Figure 4.
+        visualize: Also write STEM_labels.png, a figure of the image and its masks.
         workers: Number of processes.  [default: one per processor]
     """
     folder = cli.output_folder(output)
@@ -331,8 +327,8 @@ def average(
 ) -> cli.Result:
     """Average weights (a model soup) into best.safetensors and deepdetect.onnx.
 
-    The mean of the weights of successive runs is often better than those of each run. A single file
-    is just converted to ONNX. Files of another average are only replaced with --overwrite.
+    The mean of the weights of successive runs often scores better than any run. A single file is
+    only converted to ONNX. Files of another average are only replaced with --overwrite.
 
         deepdetect dev average first/best.safetensors second/best.safetensors -o mean
         deepdetect dev evaluate samples/ --weights mean/deepdetect.onnx
