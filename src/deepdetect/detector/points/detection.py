@@ -29,8 +29,7 @@ spread, it gets every candidate. Three candidates per keypoint would save 7 of 5
 would lower repeatability (within 3 px) by 0.01."""
 
 TILE_PX = 32
-"""Side of the square image tiles in which candidates of all scales are processed together, so that
-their pixels stay in the processor's cache. Chosen by hand."""
+"""Candidates are processed in square tiles of this side, which fit in the cache. Chosen by hand."""
 
 GRID_CELLS = 16
 """Number of grid cells along the longer side of the image if `spread` is "grid". Chosen by hand."""
@@ -62,8 +61,7 @@ def detect_points(
 ) -> Keypoints:
     """Detect keypoints of all scales in a (H, W) uint8 image, best first, as in `PointDetector`.
 
-    The logits are the outputs of the ranker. The scores are made from them: they lie in (0, 1), all
-    differ, and have the same order.
+    The logits come from the ranker. `ranking_scores` turns the logits into scores.
     """
     # Spreading needs all candidates: the strongest ones do not lie in regions of low contrast.
     limit = max_keypoints if spread == "none" else None
@@ -103,7 +101,7 @@ def rank_candidates(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
     rows = rows[:strongest]
-    # In the order of tiles, candidates of all scales use the same pixels in the cache.
+    # Sorted by tiles, successive candidates of all scales use the same pixels in the cache.
     tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
     candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
     return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))
