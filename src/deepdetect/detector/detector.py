@@ -352,8 +352,8 @@ def find_keypoints(
 ) -> Keypoints:
     """Find the keypoints of a (H, W, 3) uint8 image with any detector.
 
-    A detector is any object with a method `detect` or `heatmap` like those of this package. If it
-    has heat maps, `selection` chooses their pixels; None: those with a probability above 0.5.
+    A detector is any object with a method `detect` or `heatmap` like those of this package. If
+    the detector has heat maps, `selection` chooses their pixels; None: pixels above 0.5.
     """
     check_selection(detector, selection)
     if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):

@@ -116,7 +116,7 @@ def compute_maps(
 
 @contextmanager
 def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
-    """Replace an error for lack of memory in the block by one that names the size of the image."""
+    """Turn errors for lack of memory in the block into errors that name the size of the image."""
     try:
         yield
     except Exception as error:

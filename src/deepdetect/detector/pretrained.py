@@ -33,7 +33,7 @@ LOGITS = "logits"
 """Name of the ONNX output that holds logits; an output of another name holds probabilities."""
 
 POINTS = "keypoints", "scores", "sizes", "angles"
-"""Outputs of ONNX files that include a `PointDetector`: only other programs read these outputs."""
+"""Names of outputs of ONNX files that include a `PointDetector`. Only other programs read them."""
 
 
 def pretrained_weights(name: str = "default") -> Path:

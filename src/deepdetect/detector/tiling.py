@@ -3,7 +3,7 @@
 The network uses a few numbers about the whole image. Its exposure is computed from every 8th row
 and column, and a first pass over the tiles collects the means and maxima of the features. A second
 pass computes the logits. Tiles overlap by more than the receptive field of the convolutions, so the
-logits are the same as without tiles. (ESPNet needs pixels up to 1,738 px away, which tiles lack.)
+logits are the same as without tiles. (ESPNet cannot be tiled: it needs pixels up to 1,738 px away.)
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
 """The constants from `COUNTED` to `THRESHOLDS` name the tensors at which the network is cut."""
 
 SCALES = (4, 2, 1)
-"""Each of the three feature maps has this many rows and columns per 8 (`STRIDE`) of the image."""
+"""Rows and columns of the three feature maps per 8 (`STRIDE`) rows and columns of the image."""
 
 MARGIN = 4
-"""Border around each tile, in strides of 8 px, because convolutions need pixels 28 px away."""
+"""Border around each tile, in strides of 8 px: convolutions need pixels up to 28 px away."""
 
 BYTES_PER_PIXEL = 90
 """Approximate memory, in bytes per pixel, of a run without tiles in ONNX Runtime or OpenVINO."""

@@ -21,19 +21,19 @@ TILE_HEIGHT = 96
 """Height of a tile of dense SIFT, in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
-"""Dense SIFT sums this many filter taps at a time, so each span of taps is padded to a multiple."""
+"""Dense SIFT sums this many taps of a filter at a time, so spans of taps are padded to fit."""
 
 BINS = 36
 """Number of bins in the histogram of gradient directions around a keypoint, as in Lowe (2004)."""
 
 RADIUS_PER_WINDOW = 3.0
-"""Radius around a keypoint within which pixels vote, in sigmas of its window, as in OpenCV."""
+"""Pixels within this many sigmas of the Gaussian window vote for a direction, as in OpenCV."""
 
 CHUNK = 64
-"""Exact search keeps the minimum of each chunk of this many distances, to rank rows faster."""
+"""Exact search keeps the minimum of each chunk of this many distances, to find rows faster."""
 
 MIN_SQUARED_NORMS = 1e-3
-"""Minimum product of two squared norms, so that no correlation is divided by the norm 0."""
+"""Lower limit of the product of two squared norms, so that no correlation is divided by 0."""
 
 
 @compiled(nogil=True, fastmath=True)
@@ -318,7 +318,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
             nearer, farther = distances[query, 0], distances[query, 1]
             state = _hash(np.uint32(query) ^ _hash(np.uint32(seed + 7919 * (turn + 1))))
             for trial in range(spread + len(radii)):
-                if trial < spread:  # the match of a query at an offset in x or y, shifted by it
+                if trial < spread:  # the shifted match of a query at an offset in x or y
                     offset = offsets[trial // 4] * direction
                     right, down = (0, offset) if trial & 2 else (offset, 0)
                     x, y = xy0[query, 0] - right, xy0[query, 1] - down
@@ -357,7 +357,7 @@ def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignor
     No position is negative. The rows of kept points are written into `kept` until it is full, and
     their number is returned. To find near points, the image is divided into squares with sides of
     `cell` pixels, `columns` of them in a row. The kept points in a square form a linked list:
-    `last` holds the last point of each square, `before` the point before each point, or -1.
+    `last` holds the last point of each square, `before` the point before each; -1 means none.
     """
     rows, count = len(last) // columns, 0
     for k in range(len(x)):

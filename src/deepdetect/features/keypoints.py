@@ -192,7 +192,7 @@ class Keypoints:
         Returns:
             float32 tensors with a batch dimension: "keypoints" (1, N, 2), "keypoint_scores" (1, N),
             "scales" (1, N) in pixels, "oris" (1, N) in radians, "image_size" (1, 2) as
-            (width, height), and, if there are descriptors, "descriptors" (1, N, D) of length 1.
+            (width, height), and, if there are descriptors, "descriptors" (1, N, D), unit vectors.
 
         Raises:
             OptionError: the scale is unknown.

@@ -32,7 +32,7 @@ PRODUCTS = Path(__file__).with_name("products")
 twice the time for a product in single precision, and its threads stay busy afterwards."""
 
 MAX_EXACT_PRODUCT = 4e8
-"""Maximum product of the two numbers of keypoints for exact search by "auto". Chosen by hand."""
+"""The matcher "auto" searches exactly up to this product of keypoint counts. Chosen by hand."""
 
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
 """FLANN's code for kd-trees, the number of trees, and the number of leaves that each query visits,
@@ -42,7 +42,7 @@ SWEEPS = 4
 """Number of PatchMatch's sweeps over all queries, alternately down and up. Chosen by hand."""
 
 OFFSETS_PX = (1, 4, 12)
-"""PatchMatch tries, for each query, the shifted matches of the queries at these distances in x or y.
+"""PatchMatch tries, for each query, the shifted matches of queries at these distances in x or in y.
 The smallest distance is 1 px because dense keypoints are 1 px apart."""
 
 BAND_HEIGHT_PX = 96
@@ -296,7 +296,7 @@ class DescriptorMatches:
 
     `indices0` and `indices1` are the matched rows of the two sets, (M,) each. `ratios` are Lowe's,
     (M,) float32: the distance to the nearest descriptor divided by that to the second-nearest.
-    After `filter_matches` they are instead the probabilities that matches are wrong.
+    `filter_matches` replaces the ratios by the probabilities that matches are wrong.
     """
 
     indices0: np.ndarray

@@ -40,7 +40,7 @@ class Evidence:
         simulated_views: number of views that were simulated to find the geometry, as in ASIFT.
         on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
         verified: fraction of the matches proposed by the geometry that the images confirm. If only
-            sparse matches are returned, their fraction of the `tentative_inliers`.
+            sparse matches are returned, the `tentative_inliers` are the proposed matches.
         correlation: median ZNCC between windows of the first image and their places in the second.
             Each place is predicted by the matches around a window, not by those inside it, so it
             shows the same content if the matches are correct. 0 if there are few matches.
@@ -102,12 +102,12 @@ class GuidedMatches:
         points1: (M, 2) float64 positions in the second image.
         scores: (M,) float32 in [0, 1], higher is better.
         subpixel: whether `points1` are sub-pixel positions, as from a rectified pair.
-        indices1: (M,) int64 rows of the keypoints at `points1`; None if these are no keypoints.
+        indices1: (M,) int64 rows of the keypoints at `points1`; None if `points1` are no keypoints.
         points0: (M, 2) float64 positions in the first image, if they are not keypoints; otherwise
             None. With `points0`, a match without a keypoint near it has -1 in `indices0`.
-        alike: (M,) bool, False if the images contradict a match: the window around it in the first
-            image is no more similar to its place in the second image, as the surrounding matches
-            predict it, than unrelated windows are.
+        alike: (M,) bool, False if the images contradict a match. Surrounding matches predict where
+            the second image shows the window around a match in the first image; in contradicted
+            matches, the window is no more similar to that place than to unrelated windows.
     """
 
     indices0: np.ndarray
@@ -156,7 +156,7 @@ class _Lazy:
 
 
 def lazy(find: Callable[[], Keypoints]) -> Keypoints:
-    """Wrap a function as keypoints for `Matches`, which calls it on first access."""
+    """Wrap a function that finds keypoints as a field of `Matches`, called on first access."""
     return cast(Keypoints, find)
 
 
@@ -173,8 +173,8 @@ class Matches:
             roles. Otherwise all positions are keypoints.
         scores: (M,) float32 in [0, 1], higher is better. If a homography guided the matching, 1 -
             the dissimilarity of the two patches (at a score of 0, they are just more similar than
-            unrelated patches). If a fundamental matrix guided it, the correlation of the patches.
-            Otherwise, 1 - Lowe's ratio.
+            unrelated patches). If a fundamental matrix guided the matching, the correlation of the
+            patches. Otherwise, 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
             `GeometryOptions.inlier_threshold`; all matches if there is no geometry yet. Guided
             matches that the surrounding image contradicts are no inliers.
@@ -183,7 +183,7 @@ class Matches:
         seconds: time of each stage of the matching, for both images together, by the stage's name.
         geometry: the geometry between the images; None for `match_features`, which estimates none.
         subpixel: whether the matching itself found sub-pixel positions in the second image, on the
-            rectified pair. They then need no refinement.
+            rectified pair. These positions need no refinement.
         indices0, indices1: (M,) int32 rows of the matched keypoints in `keypoints0` and
             `keypoints1`. If a fundamental matrix guided the matching, `indices0` is the keypoint on
             whose pixel a match starts, and `indices1` the keypoint nearest to its end, up to a
@@ -231,7 +231,7 @@ class Matches:
                 f"matches need equally many points0, points1, scores and inliers, not {counts}"
             )
         if not (np.isfinite(self.points0).all() and np.isfinite(self.points1).all()):
-            raise OptionError("matches need finite positions: leave out matches without them")
+            raise OptionError("matches need finite positions: leave out those that are not finite")
         for side in (0, 1):
             name = f"indices{side}"
             indices = getattr(self, name)

@@ -21,11 +21,11 @@ from .selection import spread_over_grid
 
 SHOWN_KEYPOINTS = 1000
 AREA_OF_KEYPOINT_PX = 200
-"""Pictures show at most `SHOWN_KEYPOINTS` keypoints, and at most one per `AREA_OF_KEYPOINT_PX` square
-pixels, so that all can be told apart. Chosen by hand."""
+"""Pictures show at most `SHOWN_KEYPOINTS` keypoints, and at most one per `AREA_OF_KEYPOINT_PX`
+square pixels, so that all can be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
-"""Lowest level, from 0 to 1, of the colour scale: darker ones are hard to see. Chosen by hand."""
+"""Lowest level used of a colour scale from 0 to 1: darker colours are hard to see."""
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:

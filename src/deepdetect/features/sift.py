@@ -35,7 +35,7 @@ CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
 0.04. The thresholds apply to the contrast times the number of layers, as in OpenCV."""
 
 MIN_KEYPOINTS = 1000
-"""If there are fewer keypoints, the next lower contrast threshold is tried. Chosen by hand."""
+"""If there are fewer keypoints than this, the next lower threshold is tried. Chosen by hand."""
 
 ROWS_AT_ONCE = 1024
 """This many descriptors are converted to RootSIFT at a time: they stay in the processor's cache."""
@@ -141,8 +141,8 @@ def scaled_sift_descriptors(
 ) -> np.ndarray:
     """Compute (N, 128) uint8 SIFT descriptors of keypoints at their own sizes and angles.
 
-    As for SIFT's own keypoints, gradients come from the scale-space image nearest to the keypoint's
-    size, a diameter of two sigma. A descriptor covers a square with a side of six diameters.
+    As for SIFT's own keypoints, gradients come from the image of the scale space whose sigma is
+    nearest to half the size. A descriptor covers a square whose side is six times the size.
     """
     if not len(xy):
         return np.empty((0, 128), np.uint8)
@@ -222,7 +222,7 @@ def to_root_sift(descriptors: np.ndarray) -> np.ndarray:
     """Convert (N, 128) uint8 SIFT descriptors to RootSIFT, in place.
 
     RootSIFT (Arandjelovic and Zisserman, 2012) is the square root of L1-normalised descriptors,
-    here times 512 and at most 255. Its Euclidean distance is the Hellinger distance of SIFT.
+    here times 512 and at most 255. Its Euclidean distances are Hellinger distances of SIFT.
     """
     parallel_for(len(descriptors), _square_root, descriptors)
     return descriptors

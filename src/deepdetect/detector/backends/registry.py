@@ -29,7 +29,7 @@ BACKENDS: dict[str, Callable[[Path, RuntimeOptions], Network]] = {
     "onnxruntime": open_onnxruntime,
     "openvino": open_openvino,
 }
-"""Functions that open a file, by backend. A backend has the name of its Python package."""
+"""The function of each backend that opens a file. Backends are named after Python packages."""
 
 PRECISIONS = ("float32", "bfloat16")
 

@@ -102,7 +102,7 @@ def write_onnx(
 def write_model(
     model: ModelProto, path: str | Path, options: OnnxOptions, origin: Mapping[str, str]
 ) -> dict[str, str]:
-    """Adapt a network for any image size to `options`, and write it; return the metadata.
+    """Adapt a network that takes any image size to `options`, and write it; return the metadata.
 
     `origin` tells where the weights come from, and becomes part of the metadata.
     """

@@ -92,7 +92,7 @@ def set_sides(graph: GraphProto, kind: str, **sides: str | int) -> None:
 
 
 def replace_nodes(graph: GraphProto, nodes: Sequence[NodeProto]) -> None:
-    """Replace all nodes of a graph by `nodes`, and drop the weights that none of these reads."""
+    """Replace all nodes of a graph by `nodes`, and drop the weights that no node reads."""
     nodes = list(nodes)
     used = {name for node in nodes for name in node.input}
     weights = [one for one in graph.initializer if one.name in used]

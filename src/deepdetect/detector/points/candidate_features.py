@@ -26,9 +26,9 @@ features are divided, so that noise and rounding have little effect on logarithm
 def ring_offsets() -> np.ndarray:
     """Return the offsets, in pixels, from a candidate to its P ring points: (2, L, 2, P) int64.
 
-    The first axis is x or y. The second is the candidate's level. The third tells whether its
-    column (for x) or row (for y) is even or odd. The fourth is the ring point: the first points of
-    all rings, then the second points, and so on.
+    The first axis is x or y. The second is the candidate's level. The third tells whether the
+    candidate's column (for x) or row (for y) is even or odd. The fourth is the ring point: the
+    first points of all rings, then the second points, and so on.
     """
     angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
     reach = SIGMAS_PX[:, None, None, None] * RING_RADII

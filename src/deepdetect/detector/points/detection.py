@@ -24,9 +24,9 @@ SPREADS = ("none", "grid", "anms")
 
 CANDIDATES_PER_KEYPOINT, MIN_CANDIDATES = 6, 8192
 """The ranker gets the candidates with the highest |det Hessian|: `CANDIDATES_PER_KEYPOINT` for each
-wanted keypoint, but at least `MIN_CANDIDATES` in all. If all keypoints are wanted, or if they are
-spread, it gets every candidate. Three candidates per keypoint would save 7 of 56 ms at 640x480, but
-would lower repeatability (within 3 px) by 0.01."""
+wanted keypoint, but at least `MIN_CANDIDATES` in all. It gets every candidate if all keypoints are
+wanted, or if keypoints are spread. Three candidates per keypoint would save 7 of 56 ms at 640x480,
+but would lower repeatability (within 3 px) by 0.01."""
 
 TILE_PX = 32
 """Candidates are processed in square tiles of this side, which fit in the cache. Chosen by hand."""
@@ -39,10 +39,10 @@ DISTANCE_PX = 2.0
 
 DISTANCE_PER_SIGMA = 1.0
 """Minimum distance between two keypoints, in sigmas of the smaller one, so that one structure is
-not found at several scales. It raised the ranker's score on photos/val from 0.539 to 0.543."""
+not found at several scales. This raised the ranker's score on photos/val from 0.539 to 0.543."""
 
 SIZE_PER_SIGMA = 2.5
-"""Diameter of a keypoint, for descriptors, divided by the sigma of its scale. Chosen by hand."""
+"""Diameter at which a keypoint is described, divided by the sigma of its scale. Chosen by hand."""
 
 
 def least_distances(sigma_px: np.ndarray) -> np.ndarray:

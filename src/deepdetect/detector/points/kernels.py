@@ -31,7 +31,7 @@ def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def
         above1, above2, here1, here2 = above[1:], above[2:], here[1:], here[2:]
         below1, below2, inner = below[1:], below[2:], out[1:]
         for x in range(width - 2):
-            # Subtracting in this order keeps values small, and so the rounding errors.
+            # Subtracting in this order keeps values, and therefore rounding errors, small.
             double = np.float32(2) * here1[x]
             xx, yy = (here[x] - double) + here2[x], (above1[x] - double) + below1[x]
             xy = (below2[x] - below[x]) - (above2[x] - above[x])
