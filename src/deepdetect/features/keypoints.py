@@ -15,7 +15,7 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Diameter of a keypoint divided by its "scale" in LightGlue, for each meaning of the scale."""
+"""Diameter of a keypoint divided by its "scale" for LightGlue, for both meanings of "scale"."""
 
 MAX_COORDINATE_BITS = 12
 """`bayer_order` uses at most this many bits of x and y, so that ranks are exact in float32."""

@@ -25,7 +25,7 @@ AREA_OF_KEYPOINT_PX = 200
 square pixels, so that all can be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
-"""Lowest level used of a colour scale from 0 to 1: darker colours are hard to see."""
+"""Colours start at this level of the scale from 0 to 1, because darker colours are hard to see."""
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from .._shared.opencv import cv2
 
 LAYERS = 3
-"""Layers with keypoints per octave, as in Lowe (2004): sigma grows by 2^(1/3) with each layer."""
+"""Layers with keypoints per octave, as in Lowe (2004). Each multiplies sigma by 2^(1/3)."""
 
 BASE_SIGMA_PX = 1.6
 """Sigma of the blur of the first image of an octave, in the octave's pixels, as in Lowe (2004)."""
