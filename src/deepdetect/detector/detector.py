@@ -67,9 +67,9 @@ class DeepDetect:
         backend: "auto" (OpenVINO for bfloat16, else ONNX Runtime), "onnxruntime" or "openvino".
         device: "cpu", "cuda", or the name of any execution provider of ONNX Runtime.
         threads: number of threads. None: the backend's choice.
-        precision: number format of the network, "float32" or "bfloat16". The latter is faster, but
-            needs OpenVINO and a processor with instructions for it. A few keypoints then differ,
-            and images cannot be divided into tiles.
+        precision: number format of the network, "float32" or "bfloat16". bfloat16 is faster, but
+            needs OpenVINO and a processor with instructions for it, changes a few keypoints, and
+            does not allow tiles.
         network_channels: order of the colours in the network's input: "rgb", or "bgr" as in the
             paper's published code. For images read by OpenCV keep "rgb", and call the methods with
             `channels="bgr"`.
@@ -77,8 +77,7 @@ class DeepDetect:
             image: flipped or turned images get the same keypoints, in eight times the time.
         tile_megapixels: size, in megapixels, of the tiles into which larger images are divided if
             the resolution is "native". Tiles take less memory and about twice the time. "auto": an
-            image is divided only if memory is short. The weights "espnet" cannot run in tiles, only
-            those of the network `fast`, such as all other bundled weights.
+            image is divided only if memory is short. The weights "espnet" cannot run in tiles.
 
     Attributes:
         backend: name of the backend in use.
@@ -143,20 +142,19 @@ class DeepDetect:
         return {name: value for name, value in vars(self).items() if name != "_network"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # A pickled detector opens its network again. Bundled weights are stored by their names,
-        # which are the same on all machines.
+        # Bundled weights are pickled by name, because their path differs between machines.
         vars(self).update(state, weights=resolve_weights(state["_portable"]))
         self._network, self.backend = open_network(self.weights, self._runtime)
 
     @property
     def runtime(self) -> str:
-        """The backend and precision that heat maps depend on, such as "openvino, bfloat16"."""
+        """The backend, and the precision if it is not float32, such as "openvino, bfloat16"."""
         precision = self._runtime.precision
         return self.backend if precision == "float32" else f"{self.backend}, {precision}"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The options and the weights' digest, on which keypoints depend besides the image."""
+        """All that determines the keypoints of an image: options and the digest of the weights."""
         return {
             "detector": "network",
             "max_keypoints": self.max_keypoints,
@@ -185,8 +183,7 @@ class DeepDetect:
         Args:
             image: a path, a PIL image, or an array or PyTorch tensor: uint8, uint16 or float in
                 [0, 1]; grey, RGB or RGBA; channels last or first.
-            channels: order of the colours in arrays and tensors: "rgb", or "bgr" for images of
-                `cv2.imread`.
+            channels: colour order of arrays and tensors: "rgb", or "bgr" as from `cv2.imread`.
 
         Returns:
             (H, W) float32 in [0, 1], at the image's own size.
@@ -246,8 +243,8 @@ class DeepDetect:
             channels: see `heatmap`.
 
         Returns:
-            The keypoints in row-major order. They lie on pixel centres unless `subpixel` is set.
-            Their scores are probabilities.
+            Keypoints in row-major order, on pixel centres unless `subpixel` is set. Their scores
+            are probabilities.
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.
@@ -355,9 +352,8 @@ def find_keypoints(
 ) -> Keypoints:
     """Find the keypoints of a (H, W, 3) uint8 image with any detector.
 
-    A detector is any object with a method `detect` or `heatmap` like those of this package. The
-    selection chooses pixels of a heat map, and None chooses those with a probability above 0.5. For
-    a `DeepDetect`, pixels are ranked by their logits.
+    A detector is any object with a method `detect` or `heatmap` like those of this package. If
+    the detector has heat maps, `selection` chooses their pixels; None: pixels above 0.5.
     """
     check_selection(detector, selection)
     if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):

@@ -22,12 +22,11 @@ from .pretrained import STRIDE
 from .tiling import BYTES_PER_PIXEL, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
-"""The resolution "auto" scales images with more pixels down to this number, because finer pixels
-mostly show blur and noise."""
+"""The resolution "auto" scales larger images down to this: finer pixels mostly show noise."""
 
 RELEASE_PIXELS = 20_000_000
 """If an image with more pixels than this was scaled down for the network, the memory that the
-network keeps is released before its maps are enlarged."""
+network keeps is released before the maps are enlarged."""
 
 MIN_TILE_MEGAPIXELS = 1.5
 """Minimum size of a tile: smaller tiles would consist mostly of overlap."""
@@ -43,16 +42,15 @@ class HeatmapOptions:
 
     Attributes:
         resolution: "native" (images keep their size), a multiple of 8 (images are resized to a
-            square of this side in pixels), or "auto". The latter scales images over two megapixels
-            down to that: their finest pixels show blur and noise rather than structure, and the
-            network would need seconds and gigabytes for them.
+            square of this side in pixels), or "auto" (images over two megapixels are scaled down to
+            that: finer pixels mostly show noise, and cost seconds and gigabytes).
         network_channels: order of the colours in the network's input: "rgb", or "bgr" as in the
             paper's published code, although the weights were trained on RGB. The order in the
             images that you give is another option, `channels`.
         tta: "none", or "flip": the mean logits of eight flips and quarter turns of the image.
         tile_megapixels: size of the tiles into which larger images are divided, 1.5 or more.
-            "auto": 2.7, and only if the image is too large for the free memory. Only ONNX weights
-            of the network `fast` can run in tiles.
+            "auto": 2.7, and only if memory is short. Only ONNX weights of the network `fast` can
+            run in tiles: all bundled weights except "espnet".
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -101,8 +99,8 @@ def compute_maps(
 ) -> Maps:
     """Run the network on a (H, W, 3) uint8 RGB image.
 
-    The maps have the size of the image. If the image was scaled down for the network, they are
-    enlarged on access. The heat map of a constant image is 0.
+    The maps have the size of the image: if the image was scaled for the network, the maps are
+    scaled back on access. The heat map of a constant image is 0.
     """
     shape = rgb.shape[:2]
     if all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape)):
@@ -118,7 +116,7 @@ def compute_maps(
 
 @contextmanager
 def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
-    """Replace an error for lack of memory in the block by one that names the size of the image."""
+    """Turn errors for lack of memory in the block into errors that name the size of the image."""
     try:
         yield
     except Exception as error:
@@ -131,7 +129,6 @@ def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
 
 
 def _seen(rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
-    """Return an image with the size and channel order that the network sees."""
     seen = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
     if is_native(rgb.shape, options):
         return seen
@@ -173,7 +170,6 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
 
 
 def _run(network: Network, rgb: np.ndarray) -> np.ndarray:
-    """Return the (H, W) logits of an image, which is padded to multiples of 8 for the network."""
     height, width = rgb.shape[:2]
     planes = np.empty((1, 3, height + -height % STRIDE, width + -width % STRIDE), np.float32)
     fill_planes(rgb, planes[0])

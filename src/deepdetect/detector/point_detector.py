@@ -55,11 +55,10 @@ class PointDetector:
             surroundings of a keypoint. "learned-free" is the same network, trained only on freely
             licensed images. "cross-modal" is for images of different sensors, such as infrared and
             visible light, or for maps. "rootsift" is for programs that expect SIFT descriptors. A
-            path is an ONNX file written by `deepdetect train-descriptor`. An object needs a method
-            `describe(image, keypoints)` that returns the keypoints with descriptors, as
-            `PointDetector.describe` does.
-        backend, device, precision: as in `DeepDetect`, but keypoints are only computed with ONNX
-            Runtime on the CPU in float32, and other values raise an OptionError.
+            path is an ONNX file written by `deepdetect train-descriptor`. An object must have a
+            method `describe(image, keypoints)` like that of this class.
+        backend, device, precision: as in `DeepDetect`, but only the values that mean ONNX Runtime
+            on the CPU in float32 are allowed; others raise an OptionError.
         threads: maximum number of threads. None: one per processor.
 
     Raises:
@@ -121,7 +120,7 @@ class PointDetector:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The options and the ranker's digest, on which keypoints depend besides the image."""
+        """All that determines the keypoints of an image: options and the digest of the ranker."""
         return {
             "detector": "points",
             "ranker": file_digest(self.ranker),
@@ -220,12 +219,12 @@ class PointDetector:
 
         Args:
             image, channels: see `detect`.
-            keypoints: keypoints with sizes (RootSIFT does not need them). Angles that are missing
-                or -1 are replaced by the dominant gradient orientations.
+            keypoints: keypoints of the image. Learned descriptors need their sizes. Angles that
+                are missing or -1 are replaced by the dominant gradient orientations.
 
         Raises:
             ImageError: the image cannot be read or is unsuitable.
-            OptionError: a size is not above 0, or learned descriptors lack sizes.
+            OptionError: a size is not above 0, or keypoints for learned descriptors have no sizes.
             WeightsError: the ONNX file of the descriptor is damaged.
         """
         rgb = load_image(image, channels=channels)
@@ -275,7 +274,6 @@ class PointDetector:
         )
 
     def _scaled(self, gray: np.ndarray) -> np.ndarray:
-        """Return the image in which keypoints are found, scaled down if necessary."""
         height, width = gray.shape
         scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
         if self.resolution == "native" or scale >= 1:

@@ -33,8 +33,7 @@ LOGITS = "logits"
 """Name of the ONNX output that holds logits; an output of another name holds probabilities."""
 
 POINTS = "keypoints", "scores", "sizes", "angles"
-"""Names of the additional outputs of ONNX files that include a `PointDetector`. They are for other
-programs: this package does not read them."""
+"""Names of outputs of ONNX files that include a `PointDetector`. Only other programs read them."""
 
 
 def pretrained_weights(name: str = "default") -> Path:

@@ -1,9 +1,9 @@
 """Running the network `fast` in tiles, for images whose computation would not fit in memory.
 
-The network uses a few numbers about the whole image: its exposure, and the means and maxima of the
-features. A first pass over the tiles collects these numbers, and a second pass computes the logits.
-Tiles overlap by more than the receptive field of the convolutions, so the logits are the same as
-without tiles. (ESPNet cannot be tiled: its logits depend on pixels up to 1,738 px away.)
+The network uses a few numbers about the whole image. Its exposure is computed from every 8th row
+and column, and a first pass over the tiles collects the means and maxima of the features. A second
+pass computes the logits. Tiles overlap by more than the receptive field of the convolutions, so the
+logits are the same as without tiles. (ESPNet cannot be tiled: it needs pixels up to 1,738 px away.)
 """
 
 from __future__ import annotations
@@ -38,16 +38,13 @@ AVERAGES, MAXIMA = (
     for kind in ("Average", "Max")
 )
 THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
-"""The constants from `COUNTED` on name the tensors at which the network is cut. The names are those
-that `export_onnx` gives. All tensors have four dimensions."""
+"""The constants from `COUNTED` to `THRESHOLDS` name the tensors at which the network is cut."""
 
 SCALES = (4, 2, 1)
-"""The three feature maps have this many columns for every 8 pixels (`STRIDE`) of the image's width,
-and as many rows for every 8 pixels of its height."""
+"""Rows and columns of the three feature maps per 8 (`STRIDE`) rows and columns of the image."""
 
 MARGIN = 4
-"""Each tile is enlarged on all sides by this many strides of 8 pixels, because the convolutions
-depend on pixels up to 28 px away."""
+"""Border around each tile, in strides of 8 px: convolutions need pixels up to 28 px away."""
 
 BYTES_PER_PIXEL = 90
 """Approximate memory, in bytes per pixel, of a run without tiles in ONNX Runtime or OpenVINO."""
@@ -172,7 +169,7 @@ def _times(span: slice, scale: int) -> slice:
 
 
 def _planes(rgb: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-    """Return a tile as (1, 3, H, W) float32; at the end of the image it is not padded."""
+    """Return a tile as (1, 3, H, W) float32, without padding."""
     tile = rgb[_times(rows, STRIDE), _times(columns, STRIDE)]
     planes = np.empty((1, 3, *tile.shape[:2]), np.float32)
     fill_planes(tile, planes[0])

@@ -14,10 +14,10 @@ from .._shared.image_array import Channels, array_to_rgb, deep_values
 from .._shared.opencv import cv2
 
 MAX_SIDE_PX = 240
-"""Longest side, in pixels, of a figure in an HTML table. Table and figure take about 10 kB."""
+"""Longest side of a figure in an HTML summary. Table and figure take about 10 kB."""
 
 MAX_LINES = 60
-"""Maximum number of matches drawn as lines in the figure of an HTML table. Chosen by hand."""
+"""Maximum number of matches drawn as lines in the figure of an HTML summary. Chosen by hand."""
 
 Points = tuple[np.ndarray, tuple[int, int]]
 
@@ -64,7 +64,6 @@ def html_summary(
 
 
 def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.ndarray:
-    """Draw positions on a black (H, W, 3) uint8 BGR figure."""
     scale = min(1.0, MAX_SIDE_PX / max(side for _, size in points for side in size))
     sizes = [[max(1, round(side * scale)) for side in size] for _, size in points]
     widths, heights = zip(*sizes, strict=True)

@@ -2,9 +2,8 @@
 
 Dense SIFT works in tiles, so that intermediate results stay in the processor's cache. Each pixel of
 a tile divides its vote between the two nearest of eight orientations. The votes are summed along
-the rows of the image into the four columns of bins of each descriptor, and then along the columns
-of the image into the four rows of bins. The innermost loops run over all keypoints in a row of the
-tile and their orientations, which are adjacent in memory.
+the rows of a tile into the four columns of each descriptor's bins, and then along the columns of
+the tile into the four rows of bins. The innermost loops run over adjacent memory.
 """
 
 from __future__ import annotations
@@ -22,35 +21,31 @@ TILE_HEIGHT = 96
 """Height of a tile of dense SIFT, in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
-"""This many taps of the filters of dense SIFT are summed in one go, so the length of each span of
-taps is a multiple of it."""
+"""Dense SIFT sums this many taps of a filter at a time, so spans of taps are padded to fit."""
 
 BINS = 36
 """Number of bins in the histogram of gradient directions around a keypoint, as in Lowe (2004)."""
 
 RADIUS_PER_WINDOW = 3.0
-"""Radius within which pixels vote for the direction of a keypoint, in sigmas of the Gaussian window
-around it, as in OpenCV."""
+"""Pixels within this many sigmas of the Gaussian window vote for a direction, as in OpenCV."""
 
 CHUNK = 64
-"""The exact search keeps the minimum of each chunk of this many distances, so that it need not
-compare all distances again for every further neighbour."""
+"""Exact search keeps the minimum of each chunk of this many distances, to find rows faster."""
 
 MIN_SQUARED_NORMS = 1e-3
-"""A correlation is divided by the square root of the product of two squared norms. This is the
-minimum of the product, because a descriptor that equals the mean has norm 0."""
+"""Lower limit of the product of two squared norms, so that no correlation is divided by 0."""
 
 
 @compiled(nogil=True, fastmath=True)
 def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, taps, spans, out):  # type: ignore[no-untyped-def]
     """Write the descriptors of the keypoints in tiles `first` to `last` (exclusive) into `out`.
 
-    The orientations, (H, W) float32, are in units of 45 degrees. Keypoints lie on a lattice, whose
-    first point is the pixel `origin`, (x, y), and whose points are `step` pixels apart. `rows_of`
-    holds the row in `out` of the keypoint at each point of the lattice, or -1 if there is none.
-    `taps`, (4, T), holds the weights of T pixels along one axis around a keypoint, for each of the
-    four spatial bins, padded with zeros. `spans`, (4, 3), holds for each bin the first nonzero tap,
-    the end of its taps, rounded up to whole groups of `TAPS_AT_ONCE`, and T.
+    `magnitude` and `orientation` come from `sift_gradient`. Keypoints lie on a lattice of points
+    that are `step` pixels apart; the first is the pixel `origin`, (x, y). `rows_of` holds for each
+    point of the lattice the row of its keypoint in `out`, or -1 without one. `taps`, (4, T),
+    holds for each of the four spatial bins the weights of T pixels along one axis around a
+    keypoint, padded with zeros. `spans`, (4, 3), holds for each bin the first nonzero tap, the end
+    of its span of taps, whose length is a multiple of `TAPS_AT_ONCE`, and T.
     """
     height, width = magnitude.shape
     reach = spans[0, 2] // 2
@@ -131,7 +126,6 @@ def _sum_along_column(summed, taps, spans, out, numbers):  # type: ignore[no-unt
 
 @compiled(nogil=True, fastmath=True)
 def _add(out, weights, a, b, c, d):  # type: ignore[no-untyped-def]
-    """Add four weighted arrays to `out`."""
     for i in range(len(out)):
         out[i] += weights[0] * a[i] + weights[1] * b[i] + weights[2] * c[i] + weights[3] * d[i]
 
@@ -182,8 +176,8 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
 def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
     """Find, for each position, the nearest of (M, 2) keypoints in the 3x3 pixels around it.
 
-    `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. `nearest` is not written for
-    positions that are not finite or have no keypoint in these pixels.
+    `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. Nothing is written into
+    `nearest` for positions that are not finite, or that have no keypoint in these pixels.
     """
     height, width = grid.shape
     for k in range(first, last):
@@ -216,7 +210,7 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, inline="always")
 def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
-    """Return the two nearest rows and their distances after trying one further row."""
+    """Return the two nearest of three rows, and their distances."""
     if distance < nearer:
         return row, best, distance, nearer
     if distance < farther:
@@ -230,9 +224,9 @@ def scan_products(products, terms0, terms1, start, rows, values, nearest, best, 
     """Find nearest neighbours in both directions between a block of queries and the base.
 
     Squared distances are `terms0[i] + terms1[j] - 2 * products[i, j]`. The first query of the block
-    has the number `start`. `rows` and `values`, (Q, K), get the K nearest rows of the base for each
-    query (the lower row of a tie) and their squared distances. `nearest`, `best` and `second`
-    are updated for each of the M rows of the base: the nearest query in all blocks so far, and the
+    has the number `start`. For each query, its K nearest rows of the base (the lower row of a tie)
+    are written into `rows`, and their squared distances into `values`. For each row of the base,
+    `nearest` is updated to the nearest query of all blocks so far, and `best` and `second` to the
     squared distances of the two nearest queries.
     """
     count = products.shape[1]
@@ -310,9 +304,8 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
     and `at1` hold the row of the keypoint at each pixel of the two images, or -1. `turn` is the
     number of the sweep: even sweeps go down the image, odd ones up. Two kinds of candidates are
     tried for a query: the matches of the queries at `offsets` from it, shifted by the offset, and
-    random keypoints within `radii` around its best match. `before` holds the matches before this
-    sweep. They are used if the other query is in another band, so that the order in which bands are
-    processed does not matter.
+    random keypoints within `radii` around its best match. For queries of other bands, the matches
+    from `before` this sweep are used, so that the order of the bands does not matter.
     """
     (height0, width0), (height1, width1) = at0.shape, at1.shape
     direction = 1 - 2 * (turn % 2)
@@ -325,7 +318,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
             nearer, farther = distances[query, 0], distances[query, 1]
             state = _hash(np.uint32(query) ^ _hash(np.uint32(seed + 7919 * (turn + 1))))
             for trial in range(spread + len(radii)):
-                if trial < spread:  # the match of a query at an offset in x or y, shifted by it
+                if trial < spread:  # the shifted match of a query at an offset in x or y
                     offset = offsets[trial // 4] * direction
                     right, down = (0, offset) if trial & 2 else (offset, 0)
                     x, y = xy0[query, 0] - right, xy0[query, 1] - down
@@ -361,11 +354,10 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
 def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignore[no-untyped-def]
     """Keep each point, best first, unless a kept one is closer than the smaller of their two radii.
 
-    The points are ordered best first, and no position is negative. The rows of kept points are
-    written into `kept` until it is full, and their number is returned. To find near points, the
-    image is divided into squares with sides of `cell` pixels, `columns` of them in a row. The kept
-    points in each square form a linked list: `last` holds the last point of each square, `before`
-    the previous point of each point, and -1 means none.
+    No position is negative. The rows of kept points are written into `kept` until it is full, and
+    their number is returned. To find near points, the image is divided into squares with sides of
+    `cell` pixels, `columns` of them in a row. The kept points in a square form a linked list:
+    `last` holds the last point of each square, `before` the point before each; -1 means none.
     """
     rows, count = len(last) // columns, 0
     for k in range(len(x)):
@@ -400,8 +392,8 @@ ATAN = tuple(
 def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def]
     """Return the dominant gradient directions around (N, 2) pixels, (N,) float32 degrees.
 
-    Gradients vote for `BINS` directions, weighted by a Gaussian window around the pixel. `windows`
-    holds the sigmas of these windows. The outermost pixels of the image do not vote.
+    Gradients vote for `BINS` directions, weighted by a Gaussian window around the pixel, whose
+    sigma is given in `windows`. The outermost pixels of the image do not vote.
     """
     height, width = image.shape
     angles = np.zeros(len(pixels), np.float32)

@@ -15,10 +15,10 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Diameter of a keypoint divided by the "scale" for LightGlue, for both meanings of the scale."""
+"""Diameter of a keypoint divided by its "scale" for LightGlue, for both meanings of "scale"."""
 
 MAX_COORDINATE_BITS = 12
-"""`bayer_order` uses this many bits of x and of y at most, so that float32 holds ranks exactly."""
+"""`bayer_order` uses at most this many bits of x and y, so that ranks are exact in float32."""
 
 UNSET_ANGLE = -1
 """OpenCV gives this angle to keypoints without an orientation."""
@@ -152,7 +152,7 @@ class Keypoints:
 
         Args:
             size: diameter in pixels if the keypoints have no sizes.
-            angle: orientation in degrees if they have no angles (-1: unset).
+            angle: orientation in degrees if the keypoints have no angles (-1: unset).
 
         Example:
             >>> (point,) = Keypoints([[3, 4]], [0.5], (8, 8)).to_opencv(size=5)
@@ -185,15 +185,14 @@ class Keypoints:
 
         Args:
             scale: meaning of "scales": "diameter", as in LightGlue's own extractor for OpenCV, or
-                "sigma", half the diameter, as in its extractor for COLMAP and in kornia's
-                `LightGlueMatcher`. LightGlue and kornia use the same weights.
+                "sigma", half the diameter, as in LightGlue's extractor for COLMAP and in kornia.
             size: diameter in pixels for keypoints without a size.
             angle: orientation in degrees for keypoints without an angle.
 
         Returns:
             float32 tensors with a batch dimension: "keypoints" (1, N, 2), "keypoint_scores" (1, N),
             "scales" (1, N) in pixels, "oris" (1, N) in radians, "image_size" (1, 2) as
-            (width, height), and, if there are descriptors, "descriptors" (1, N, D) of length 1.
+            (width, height), and, if there are descriptors, "descriptors" (1, N, D), unit vectors.
 
         Raises:
             OptionError: the scale is unknown.
@@ -314,9 +313,8 @@ def unit_length(descriptors: np.ndarray) -> np.ndarray:
 def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Rank (N, 2) positions so that the first of them, however many, are spread evenly.
 
-    The ranks, (N,) float32 in [0, 1), come from ordered dithering. They are values of a Bayer
-    matrix that covers an image of this (width, height), each at the pixel nearest to the position.
-    Neighbouring pixels get very different ranks.
+    The ranks, (N,) float32 in [0, 1), are values of a Bayer matrix (ordered dithering) that covers
+    an image of this (width, height), at the pixels nearest to the positions.
     """
     column, row = np.rint(np.asarray(xy).reshape(-1, 2)).astype(np.int64).T
     bits = min(MAX_COORDINATE_BITS, max(1, (max(size) - 1).bit_length()))
@@ -333,7 +331,7 @@ def nearest_keypoints(
     """Find the keypoint nearest to each of (N, 2) positions, within the 3x3 pixels around it.
 
     If several keypoints lie on one pixel, only the first is used. Returns (N,) int32 rows of `xy`
-    and (N,) distances in pixels; they are -1 and infinity if no keypoint is near.
+    and (N,) distances in pixels: -1 and infinity if no keypoint is near.
     """
     from .kernels import nearest_of_nine
 

@@ -34,7 +34,7 @@ complex numbers. If the image is rotated, the phase of each complex number grows
 rotation times its factor in this array."""
 
 UPRIGHT_DEGREES = 15.0
-"""Smaller rotations between images need not be undone: the networks have learned to bear them."""
+"""Smaller rotations between images need not be undone: networks have learned to tolerate them."""
 
 TURNED_KEYPOINTS = 512
 """This many keypoints of each image, the best ones, are matched to estimate the rotation between
@@ -43,7 +43,7 @@ the images. Chosen by hand."""
 HISTOGRAM_DEGREES = 10
 NEAR_DEGREES = 20
 """`common_turn` makes a histogram of angles with bins of width `HISTOGRAM_DEGREES`. It returns the
-median of the angles within `NEAR_DEGREES` of the fullest bin. Both were chosen by hand."""
+median of the angles within `NEAR_DEGREES` of the fullest bin. Chosen by hand."""
 
 
 def is_learned(descriptor_type: str | None) -> bool:
@@ -80,9 +80,9 @@ def match_learned(
     """Match learned descriptors after undoing the rotation between the two images.
 
     Descriptors that are rotated to the keypoints' own angles match under any rotation of the image.
-    Matches of the best keypoints therefore tell the rotation between the images. All keypoints are
-    then matched by upright descriptors, of which only this common rotation is undone. These are
-    more distinctive, and give about a sixth more matches.
+    Matches of the best keypoints therefore tell the rotation between the images. Then only this
+    common rotation is undone, and all keypoints are matched by upright descriptors, which are more
+    distinctive and give about a sixth more matches.
     """
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
     assert descriptors0 is not None

@@ -2,9 +2,9 @@
 
 From one image to the other, correct matches move, rotate and change scale as their neighbours do,
 but wrong matches do so at random. A network of 25,000 parameters (MATCH_FILTER_CARD.md) has learned
-how similar the changes of neighbours are, also on surfaces that bend and move. It sees Lowe's
-ratios but not the descriptors, so it works with several types of descriptors. It replaces the ratio
-test, which discards correct matches on repeated structures.
+how similarly neighbours change, also on surfaces that bend and move. It sees Lowe's ratios but no
+descriptors, so it suits several types of descriptors. The filter replaces the ratio test, which
+discards correct matches on repeated structures.
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ from .sift import ROOT_SIFT
 MATCH_FILTER = Path(__file__).with_name("match_filter.onnx")
 
 AROUND = 8
-"""Each match is compared with the matches nearest to it: this many in each of the two images. The
-network needs exactly this number."""
+"""Number of nearest matches, in each image, that the network needs to judge a match."""
 
 MOST_DISTINCT = 512
-"""This many matches, with the lowest ratios, give the rotation between images. Chosen by hand."""
+"""This many matches with the lowest ratios tell the rotation between images. Chosen by hand."""
 
 FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
 """FLANN's codes for a kd-tree for few dimensions, and for an exact search."""
@@ -46,8 +45,8 @@ def check_filter(filter_by: str, ratio: float | None, mutual: bool) -> None:
 def suits_filter(features: Keypoints) -> bool:
     """Return whether keypoints have sizes, angles and descriptors that the filter supports.
 
-    Cross-modal descriptors are not supported, because keypoints turn by 180 degrees where dark and
-    bright are swapped between the images.
+    Cross-modal descriptors are not supported: where dark and bright are swapped between images,
+    keypoints turn by 180 degrees.
     """
     kind, sizes, angles = features.descriptor_type, features.sizes, features.angles
     served = kind == ROOT_SIFT or (is_learned(kind) and not str(kind).startswith(CROSS_MODAL))
@@ -70,9 +69,8 @@ def filter_matches(
 ) -> DescriptorMatches:
     """Keep the mutual nearest neighbours that are more likely correct than wrong.
 
-    If there are at most `AROUND` matches, none is kept, because they have too few neighbours. The
-    keypoints must suit the filter (`suits_filter`). In the result, `ratios` are not Lowe's, but the
-    network's probabilities that matches are wrong.
+    Keypoints must suit the filter (`suits_filter`). If there are at most `AROUND` matches, none is
+    kept. In the result, `ratios` are the network's probabilities that matches are wrong.
     """
     if len(matches) <= AROUND:
         none = np.empty(0, np.int32)
@@ -116,8 +114,8 @@ def nearest_rows(xy: np.ndarray) -> np.ndarray:
     own = np.arange(len(xy))[:, None]
     tree = cv2.flann_Index(xy, {"algorithm": FLANN_KDTREE_SINGLE, "leaf_max_size": 10})
     near = tree.knnSearch(xy, AROUND + 1, params={"checks": ALL_LEAVES})[0].astype(np.int64)
-    # A position's own row is moved to the end, and dropped there. If many positions coincide,
-    # its own row may be missing, and the last of the others is dropped.
+    # Each position's own row is moved to the end and dropped. If many positions coincide, the own
+    # row may be missing, and the last of the other rows is dropped.
     return np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]
 
 

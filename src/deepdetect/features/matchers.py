@@ -28,28 +28,25 @@ MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
 """Maximum length of uint8 descriptors whose squared distances are exact in single precision."""
 
 PRODUCTS = Path(__file__).with_name("products")
-"""Folder of ONNX files with one matrix product each, made by `tools/product_graphs.py`. NumPy's
-product in single precision takes twice the time of ONNX Runtime's, and NumPy's threads keep
-processors busy afterwards."""
+"""Folder of ONNX files with one matrix product each, made by `tools/product_graphs.py`. NumPy takes
+twice the time for a product in single precision, and its threads stay busy afterwards."""
 
 MAX_EXACT_PRODUCT = 4e8
-"""The matcher "auto" searches exactly if the product of the numbers of keypoints in the two images
-is at most this. Chosen by hand."""
+"""The matcher "auto" searches exactly up to this product of keypoint counts. Chosen by hand."""
 
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
 """FLANN's code for kd-trees, the number of trees, and the number of leaves that each query visits,
 as in the paper's code."""
 
 SWEEPS = 4
-"""Number of PatchMatch's sweeps over all queries, down and up the image in turn. Chosen by hand."""
+"""Number of PatchMatch's sweeps over all queries, alternately down and up. Chosen by hand."""
 
 OFFSETS_PX = (1, 4, 12)
-"""PatchMatch tries, for each query, the shifted matches of other queries at these distances in x or
-in y. The smallest is 1 because dense keypoints are 1 px apart."""
+"""PatchMatch tries, for each query, the shifted matches of queries at these distances in x or in y.
+The smallest distance is 1 px because dense keypoints are 1 px apart."""
 
 BAND_HEIGHT_PX = 96
-"""PatchMatch divides the first image into bands of this height, which threads process in parallel.
-The result depends on the height, but not on the number of threads. Chosen by hand."""
+"""Height of the bands of the first image that PatchMatch's threads process. Chosen by hand."""
 
 SEARCH_SHRINK = 3
 """PatchMatch also tries random positions around the best match. The first radius is half the longer
@@ -75,8 +72,8 @@ def exact_neighbours(
 ) -> Neighbours:
     """Find the exact nearest neighbours by matrix products; a `Matcher`.
 
-    Among equally near rows of the base, the lower one is taken. The time grows with the number of
-    queries times the number of rows, so this suits up to tens of thousands of keypoints.
+    Among equally near rows of the base, the lower is taken. The time grows with the product of the
+    numbers of queries and rows, so this suits up to tens of thousands of keypoints.
     """
     return _search_both_ways(queries, base, count)[:2]
 
@@ -84,7 +81,7 @@ def exact_neighbours(
 def _search_both_ways(
     queries: np.ndarray, base: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `exact_neighbours`, and the nearest query of each row of the base, (M,) int32."""
+    """Return the result of `exact_neighbours`, and the nearest query of each row of the base."""
     from .kernels import scan_products
 
     width = base.shape[1]
@@ -112,8 +109,8 @@ def _search_both_ways(
         scan_products(*block, rows[part], squared[part], nearest, best, second)
     if whole or not len(queries):
         return rows[:, :count], np.sqrt(squared[:, :count]), nearest
-    # Rounding errors of the products and terms are below `bound`, relative to the descriptors'
-    # lengths. Neighbours that differ by less are searched again in double precision.
+    # Rounding errors of squared distances are below `bound`, relative to the descriptors' lengths.
+    # Neighbours whose squared distances differ by less are searched again in double precision.
     lengths = np.sqrt(terms0), np.sqrt(terms1)
     bound = (width / 2 + 8) * float(np.finfo(np.float32).eps)
     doubt = bound * (lengths[0] + lengths[1].max()) ** 2
@@ -135,7 +132,6 @@ def _search_both_ways(
 
 
 def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.ndarray:
-    """Return the rows of the nearest neighbours of a few queries, in double precision."""
     rows = np.empty((len(queries), count), np.int32)
     squares = np.einsum("ij,ij->i", base, base, dtype=np.float64)
     step = max(1, BLOCK_SIZE // (2 * len(base)))
@@ -156,9 +152,9 @@ def _product(name: str) -> Any:
 def _byte_product() -> tuple[Any, int]:
     """Return a session that multiplies matrices of bytes, and the offset to subtract from the base.
 
-    The fastest instructions (VNNI) multiply unsigned by signed bytes: subtracting 128 makes those
-    of the base signed. On processors without VNNI, sums of such products saturate. There both
-    matrices stay unsigned, and the offset is 0.
+    The fastest instructions (VNNI) multiply unsigned by signed bytes, so 128 is subtracted from the
+    base. On processors without VNNI, sums of such products saturate. There both matrices stay
+    unsigned, and the offset is 0.
     """
     session = _product("signed")
     most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
@@ -194,7 +190,7 @@ def flann_neighbours(
 ) -> Neighbours:
     """Find approximate nearest neighbours by FLANN's randomised kd-trees.
 
-    `trees` is their number, and `checks` the number of leaves that each query visits. The other
+    `trees` is the number of trees, `checks` the number of leaves that each query visits. The other
     arguments and the result are those of a `Matcher`.
     """
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
@@ -204,8 +200,7 @@ def flann_neighbours(
         index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
         return index.knnSearch(queries, count, params={"checks": checks})
 
-    # OpenCV has one random number generator per thread. A thread of its own keeps this search
-    # from changing the caller's generator.
+    # OpenCV has one random generator per thread: a new thread leaves the caller's unchanged.
     with ThreadPoolExecutor(1) as thread:
         rows, squared = thread.submit(search).result()
     return rows, np.sqrt(squared)
@@ -218,9 +213,9 @@ def patchmatch_neighbours(
 
     If a query lies next to another one, the other's match, shifted by the offset between the two,
     is probably a good match (Barnes et al., "PatchMatch", 2009). On hundreds of thousands of dense
-    keypoints this takes a twentieth of FLANN's time and finds more correct matches. It does not
-    suit few or scattered keypoints. Descriptors must be uint8 and keypoints on whole pixels. The
-    number of threads does not change the result.
+    keypoints, PatchMatch takes a twentieth of FLANN's time and finds more correct matches, but it
+    does not suit few or scattered keypoints. Descriptors must be uint8 and keypoints on whole
+    pixels. The number of threads does not change the result.
     """
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(
@@ -233,8 +228,7 @@ def patchmatch_neighbours(
     from . import kernels
 
     xy0, xy1 = (np.asarray(xy).astype(np.int32) for xy in positions)
-    # Queries are sorted in row-major order, because a sweep builds on the queries before. Most
-    # detectors return keypoints in this order already.
+    # Queries are sorted in row-major order, because a sweep builds on the queries before.
     order = np.lexsort((xy0[:, 0], xy0[:, 1]))
     queries, xy0 = queries[order], xy0[order]
     at0, at1 = _grid(xy0), _grid(xy1)
@@ -257,10 +251,7 @@ def patchmatch_neighbours(
 
 
 def _grid(xy: np.ndarray) -> np.ndarray:
-    """Return an image with the row of the position at each pixel, and -1 at pixels without one.
-
-    It is the smallest image that holds all positions.
-    """
+    """Return an image with the row of the position at each pixel, and -1 at pixels without one."""
     width, height = xy.max(axis=0) + 1
     grid = np.full((height, width), -1, np.int32)
     grid[xy[:, 1], xy[:, 0]] = np.arange(len(xy))
@@ -305,7 +296,7 @@ class DescriptorMatches:
 
     `indices0` and `indices1` are the matched rows of the two sets, (M,) each. `ratios` are Lowe's,
     (M,) float32: the distance to the nearest descriptor divided by that to the second-nearest.
-    After `filter_matches` they are instead the probabilities that matches are wrong.
+    `filter_matches` replaces the ratios by the probabilities that matches are wrong.
     """
 
     indices0: np.ndarray

@@ -16,7 +16,7 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""The end of a match belongs to the nearest keypoint up to this far away. Chosen by hand."""
+"""The end of a match belongs to the nearest keypoint within this distance. Chosen by hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,
@@ -36,13 +36,11 @@ class Evidence:
         tentative_inliers: number of tentative matches that agree with the geometry, plus further
             matches that were found along its epipolar lines.
         log10_nfa: decimal logarithm of the geometry's number of false alarms (a contrario): the
-            number of geometries with as many inliers that is expected among random matches.
+            expected number of geometries with as many inliers among random matches.
         simulated_views: number of views that were simulated to find the geometry, as in ASIFT.
         on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
-        verified: fraction of the matches proposed by the geometry that the images confirm. A
-            homography proposes partners of keypoints. A fundamental matrix proposes one match for
-            each keypoint of the first image. If only sparse matches are returned, the
-            `tentative_inliers` count as proposed.
+        verified: fraction of the matches proposed by the geometry that the images confirm. If only
+            sparse matches are returned, the `tentative_inliers` are the proposed matches.
         correlation: median ZNCC between windows of the first image and their places in the second.
             Each place is predicted by the matches around a window, not by those inside it, so it
             shows the same content if the matches are correct. 0 if there are few matches.
@@ -89,7 +87,6 @@ class TwoViewGeometry:
 
 
 def _swapped(model: str, matrix: np.ndarray | None) -> np.ndarray | None:
-    """Return the matrix of a model from the second image to the first."""
     if matrix is None or model != "homography":
         return None if matrix is None else matrix.T
     inverse = np.linalg.inv(matrix)
@@ -105,12 +102,12 @@ class GuidedMatches:
         points1: (M, 2) float64 positions in the second image.
         scores: (M,) float32 in [0, 1], higher is better.
         subpixel: whether `points1` are sub-pixel positions, as from a rectified pair.
-        indices1: (M,) int64 rows of the keypoints at `points1`; None if these are no keypoints.
+        indices1: (M,) int64 rows of the keypoints at `points1`; None if `points1` are no keypoints.
         points0: (M, 2) float64 positions in the first image, if they are not keypoints; otherwise
             None. With `points0`, a match without a keypoint near it has -1 in `indices0`.
-        alike: (M,) bool, False if the images contradict a match: the window around it in the first
-            image is no more similar to its place in the second image, as the surrounding matches
-            predict it, than unrelated windows are.
+        alike: (M,) bool, False if the images contradict a match. Surrounding matches predict where
+            the second image shows the window around a match in the first image; in contradicted
+            matches, the window is no more similar to that place than to unrelated windows.
     """
 
     indices0: np.ndarray
@@ -129,7 +126,7 @@ class GuidedMatches:
         return xy0[self.indices0] if self.points0 is None else self.points0
 
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
-        """Return these matches joined with those of `other` where the mask `chosen` is true."""
+        """Return these matches and those of `other` that the mask `chosen` selects."""
         order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")
 
         def both(name: str) -> np.ndarray:
@@ -159,7 +156,7 @@ class _Lazy:
 
 
 def lazy(find: Callable[[], Keypoints]) -> Keypoints:
-    """Wrap a function as keypoints for `Matches`, which calls it on first access."""
+    """Wrap a function that finds keypoints as a field of `Matches`, called on first access."""
     return cast(Keypoints, find)
 
 
@@ -170,14 +167,14 @@ class Matches:
 
     Attributes:
         points0, points1: (M, 2) float32 positions in the first and in the second image, matched row
-            by row, in pixels; the centre of the first pixel is (0, 0). They are keypoints, unless a
-            fundamental matrix guided the matching. Then `points0` are pixels with keypoints, and
-            `points1` the places where the second image shows these pixels. With `mutual` the two
-            images may have swapped these roles.
+            by row, in pixels; the centre of the first pixel is (0, 0). If a fundamental matrix
+            guided the matching, `points0` are pixels with keypoints, and `points1` the places where
+            the second image shows these pixels; with `mutual`, the images may have swapped these
+            roles. Otherwise all positions are keypoints.
         scores: (M,) float32 in [0, 1], higher is better. If a homography guided the matching, 1 -
             the dissimilarity of the two patches (at a score of 0, they are just more similar than
-            unrelated patches). If a fundamental matrix guided it, the correlation of the patches.
-            Otherwise, 1 - Lowe's ratio.
+            unrelated patches). If a fundamental matrix guided the matching, the correlation of the
+            patches. Otherwise, 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
             `GeometryOptions.inlier_threshold`; all matches if there is no geometry yet. Guided
             matches that the surrounding image contradicts are no inliers.
@@ -186,15 +183,15 @@ class Matches:
         seconds: time of each stage of the matching, for both images together, by the stage's name.
         geometry: the geometry between the images; None for `match_features`, which estimates none.
         subpixel: whether the matching itself found sub-pixel positions in the second image, on the
-            rectified pair. They then need no refinement.
+            rectified pair. These positions need no refinement.
         indices0, indices1: (M,) int32 rows of the matched keypoints in `keypoints0` and
             `keypoints1`. If a fundamental matrix guided the matching, `indices0` is the keypoint on
-            whose pixel a match starts. `indices1` is the nearest keypoint to its end, up to a pixel
-            away, or -1 (`m[m.indices1 >= 0]` drops matches without one). With `mutual` the two
-            images may have swapped these roles. None: the nearest keypoints are looked up.
+            whose pixel a match starts, and `indices1` the keypoint nearest to its end, up to a
+            pixel away, or -1 (`m[m.indices1 >= 0]` drops matches without a keypoint); with
+            `mutual`, these roles may be swapped. None: the nearest keypoints are looked up.
 
-    The keypoints of an image do not depend on the other image. With the same options, an index is
-    therefore the same keypoint in all pairs with this image, and matches can be joined to tracks.
+    With the same options, an index means the same keypoint in all pairs with this image, because
+    keypoints do not depend on the other image. So matches of several pairs can be joined to tracks.
 
     `len` and indexing by slices, masks, index arrays and whole numbers work: `m[m.inliers]`.
 
@@ -234,7 +231,7 @@ class Matches:
                 f"matches need equally many points0, points1, scores and inliers, not {counts}"
             )
         if not (np.isfinite(self.points0).all() and np.isfinite(self.points1).all()):
-            raise OptionError("matches need finite positions: leave out matches without them")
+            raise OptionError("matches need finite positions: leave out those that are not finite")
         for side in (0, 1):
             name = f"indices{side}"
             indices = getattr(self, name)
@@ -248,7 +245,7 @@ class Matches:
             object.__setattr__(self, name, self._checked_indices(indices, side))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state to be pickled, which holds keypoints, not a function that finds them."""
+        # The state that is pickled holds the keypoints, not functions that find them.
         return {**self.__dict__, "keypoints0": self.keypoints0, "keypoints1": self.keypoints1}
 
     @property
@@ -382,7 +379,6 @@ class Matches:
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def _repr_html_(self) -> str:
-        """Return HTML for notebooks: a small table, and a figure with some of the matches."""
         from .display import html_summary
 
         inliers, geometry = np.count_nonzero(self.inliers), self.geometry
@@ -415,7 +411,6 @@ class Matches:
         )
 
     def _checked_indices(self, indices: np.ndarray, side: int) -> np.ndarray:
-        """Return the checked indices of an image's keypoints as int32."""
         if indices.shape != (len(self),) or (indices.size and indices.dtype.kind not in "iu"):
             raise OptionError(
                 f"matches need one whole number per match in indices{side}, not {indices.dtype} "
@@ -432,10 +427,7 @@ class Matches:
 
 
 def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Return a number for each end of a match, the same for equal ends.
-
-    It is the index of the keypoint or, without one, a negative number for the pixel.
-    """
+    """Return numbers of the ends of matches: keypoint indices, or negative numbers for pixels."""
     ends = indices.astype(np.int64)
     without = np.flatnonzero(indices < 0)
     if len(without):

@@ -21,20 +21,18 @@ from .selection import spread_over_grid
 
 SHOWN_KEYPOINTS = 1000
 AREA_OF_KEYPOINT_PX = 200
-"""`SHOWN_KEYPOINTS` is the maximum number of keypoints that are drawn. Small images get at most one
-keypoint per `AREA_OF_KEYPOINT_PX` square pixels, so that all can be told apart. Chosen by hand."""
+"""Pictures show at most `SHOWN_KEYPOINTS` keypoints, and at most one per `AREA_OF_KEYPOINT_PX`
+square pixels, so that all can be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
-"""Keypoints use the colour scale, from 0 to 1, only from this level up, because darker colours are
-hard to see. Chosen by hand."""
+"""Colours start at this level of the scale from 0 to 1, because darker colours are hard to see."""
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     """Draw the best keypoints of all parts of an image, with a scale for their colours.
 
     The colour is the logit or, without logits, the score. At most `SHOWN_KEYPOINTS` are drawn: the
-    best of each cell of a grid, then the second-best of each, and so on. Circles show the sizes of
-    keypoints if they are known. `fit_picture` scales large images down.
+    best of each cell of a grid, then the second-best, and so on. Circles show the sizes, if known.
     """
     shown = fit_picture(rgb)
     factor = shown.shape[1] / rgb.shape[1]
@@ -69,7 +67,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
 
 
 def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw all keypoints, scale the picture down if large, and add a caption with their number."""
+    """Draw all keypoints, scale a large picture down, and add a caption with their number."""
     caption = f"{_counted(keypoints)}, {keypoints.density:.1%} of the pixels"
     return add_caption(fit_picture(keypoints.draw(rgb)), caption)
 

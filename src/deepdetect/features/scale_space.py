@@ -9,7 +9,7 @@ import numpy as np
 from .._shared.opencv import cv2
 
 LAYERS = 3
-"""Layers with keypoints per octave, as in Lowe (2004): each has 2^(1/3) times the sigma before."""
+"""Layers with keypoints per octave, as in Lowe (2004). Each multiplies sigma by 2^(1/3)."""
 
 BASE_SIGMA_PX = 1.6
 """Sigma of the blur of the first image of an octave, in the octave's pixels, as in Lowe (2004)."""
@@ -21,11 +21,11 @@ SIZE_PER_SIGMA = 2.0
 """The size of a SIFT keypoint in OpenCV is this many times the sigma of its scale."""
 
 MIN_SIDE_PX = 8
-"""Octaves whose images have a side shorter than this are not used. Chosen by hand."""
+"""Octaves are not used if a side of their images is shorter than this. Chosen by hand."""
 
 
 def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each keypoint the octave and the layer, 1 to 3, whose sigma is nearest to its own.
+    """Return the octaves and the layers, 1 to 3, whose sigmas are nearest to those of keypoints.
 
     The (N,) sizes are twice the keypoints' sigmas, as in OpenCV's SIFT. `shape` is the image's
     (height, width). Octave -1 is the image enlarged to twice its size.
@@ -49,8 +49,8 @@ def gaussian_layers(
 ) -> Iterator[tuple[int, int, np.ndarray]]:
     """Yield the images of the scale space from fine to coarse, as (octave, layer, image).
 
-    They are (H, W) float32. The pixel (x, y) of octave o lies at (2^o x, 2^o y) in the given image.
-    Layers go from 0 to 3.
+    Images are (H, W) float32. The pixel (x, y) of octave o lies at (2^o x, 2^o y) in `gray`. Layers
+    go from 0 to 3.
     """
     image = gray.astype(np.float32)
     sigma = CAMERA_SIGMA_PX
@@ -74,8 +74,7 @@ def gaussian_layers(
 
 
 WINDOW_PER_SIGMA = 1.5
-"""The gradients that vote for the orientation are weighted by a Gaussian window. Its sigma is this
-many times that of the keypoint, as in Lowe (2004)."""
+"""Sigma of the Gaussian window for orientations, in sigmas of the keypoint, as in Lowe (2004)."""
 
 
 def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -85,8 +84,7 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
     directions. The histogram is smoothed, and a parabola through its highest bin and the two
     neighbouring bins gives the angle. Angles are in degrees, in [0, 360), from the x axis towards
     the y axis, which points down; they are 0 in flat regions. Sizes are diameters, twice sigma.
-    SIFT adds further keypoints for directions with nearly as many votes. Here only the direction
-    with the most votes counts.
+    Unlike in SIFT, a keypoint gets only one orientation.
     """
     from .kernels import strongest_directions
 

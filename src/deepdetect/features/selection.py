@@ -13,8 +13,7 @@ from .._shared.options import numbers_of, suggest_keywords
 from .keypoints import Keypoints, bayer_order
 
 MAX_OFFSET_PX = 0.499
-"""Sub-pixel refinement moves a keypoint by at most this much in x and in y. As this is below 0.5,
-the nearest pixel of the keypoint stays the same."""
+"""Maximum sub-pixel shift in x and in y: below 0.5, so that the nearest pixel stays the same."""
 
 Rows = Callable[[slice], np.ndarray]
 """A function that returns the requested rows of a map."""
@@ -23,11 +22,10 @@ BAND_PIXELS = 4_000_000
 """Maps are processed in bands of rows with about this many pixels, to limit the memory."""
 
 GRID_CELLS = 24
-"""Number of grid cells along the longer side of the image. `spread_over_grid` takes the best
-keypoint of each cell before any second-best, so that keypoints cover the image. Chosen by hand."""
+"""Number of cells of `spread_over_grid` along the longer side of the image. Chosen by hand."""
 
 DISTANCE_STEP_PX = 0.25
-"""Precision with which `spread_by_distance` finds the largest distance. Chosen by hand."""
+"""Precision of the largest distance that `spread_by_distance` finds. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +33,8 @@ class Maps:
     """A heat map and the logits that rank its pixels, each computed on demand.
 
     Both maps are (H, W) float32. `heatmap()` computes the heat map, and returns a function that
-    gives its rows. `logits()` computes and returns the logits. Each map of a large image takes more
-    memory than its keypoints, so only one is held at a time.
+    gives its rows. `logits()` computes and returns the logits. A map of a large image takes more
+    memory than the keypoints, so only one map is held at a time.
     """
 
     shape: tuple[int, ...]
@@ -120,16 +118,16 @@ def select_keypoints(
 ) -> Keypoints:
     """Select the dense keypoints of a heat map.
 
-    With the heat map and the logits of `DeepDetect.heatmap_and_logits` the result is that of
-    `detect` with the same options, without another run of the network.
+    With the heat map and the logits of `DeepDetect.heatmap_and_logits`, the result is the same as
+    that of `detect` with the same options.
 
     Args:
         heatmap: (H, W) float32 probabilities.
         options: which pixels are selected. The order of the steps is: ignore mask, threshold,
             suppression, density or maximum number, sub-pixel refinement.
-        logits: (H, W) float32 logits of the heat map, by which pixels are ranked. None: they are
-            ranked by the heat map, although float32 rounds its highest probabilities to 1. Ties are
-            broken by an order that spreads the keypoints evenly (`bayer_order`).
+        logits: (H, W) float32 logits of the heat map, by which pixels are ranked. None: pixels are
+            ranked by the heat map, whose highest probabilities float32 rounds to 1. Ties are broken
+            by an order that spreads the keypoints evenly (`bayer_order`).
         ignore: (H, W) array of bool or numbers, true or not 0 where keypoints are ignored.
 
     Returns:
@@ -174,8 +172,7 @@ def select_from_maps(
         (rows, slice(end - count, end))
         for rows, end, count in zip(bands(maps.shape), np.cumsum(counts), counts, strict=True)
     ]
-    # Only one map is held at a time: first the logits, then the heat map. The parts of `xy` and
-    # `scores` that are not yet written take no memory.
+    # To save memory, the logits are freed before the heat map is computed.
     for rows, part in parts:
         pixels = _unpack(chosen[rows], width)
         logits[part] = ranking[rows].ravel()[pixels]
@@ -227,7 +224,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
     ranks = ranking.ravel()
 
     def wanted(rows: slice) -> np.ndarray:
-        """Return the flat indices of the pixels of a band that pass and are not suppressed."""
+        """Return the flat indices of a band's pixels that pass and are not suppressed."""
         # Suppression also depends on the pixels within `radius` outside the band.
         seen = slice(max(0, rows.start - radius), min(height, rows.stop + radius))
         pixels = _unpack(passing[seen], width)
@@ -286,9 +283,8 @@ def _is_highest(
 ) -> np.ndarray:
     """Return, for each pixel, whether it ranks highest in the square window around it.
 
-    `pixels` are flat indices in a band of this shape, which starts at row `first_row` of an image
-    of this height. Among equal scores the first pixel in `bayer_order` ranks highest, so that one
-    pixel of a plateau is kept.
+    `pixels` are flat indices in a band of this shape, which starts at row `first_row` of the image.
+    Among equal scores, the first pixel in `bayer_order` ranks highest.
     """
     kind = np.float32 if scores.dtype == np.float32 else np.float64
     image = np.full(shape, -np.inf, kind)
@@ -371,10 +367,9 @@ def spread_over_grid(
     max_keypoints: int,
     grid_cells: int = GRID_CELLS,
 ) -> np.ndarray:
-    """Choose keypoints by score, in turn from all cells of a grid.
+    """Choose the best keypoint of each cell of a grid, then the second-best of each, and so on.
 
-    Returns at most `max_keypoints` rows of `xy`: the best keypoint of each cell, then the
-    second-best of each, and so on. There are `grid_cells` cells along the longer side of the image.
+    Returns at most `max_keypoints` rows of `xy`. `grid_cells` cells cover the image's longer side.
     """
     side = max(image_size) / grid_cells
     cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
@@ -393,7 +388,7 @@ def descending_order(values: np.ndarray) -> np.ndarray:
     """
     if values.dtype != np.float32:
         return np.argsort(-values, kind="stable")
-    # Read as an integer, the bits of a float grow with its magnitude, also for negative floats.
+    # Read as integers, the bits of floats have the order of their magnitudes.
     bits = (values + np.float32(0)).view(np.int32)
     keys = np.where(bits < 0, bits & 0x7FFFFFFF, ~bits).astype(np.int64) << 32
     keys |= np.arange(len(values))

@@ -25,8 +25,7 @@ DENSE_SIZES_PX = (2.0, 8.0)
 """Range of keypoint diameters, in pixels, that `dense_sift` supports."""
 
 MIN_DENSE_DENSITY = 0.02
-"""`dense_sift` is faster than describing one keypoint at a time if there are more keypoints per
-pixel than this."""
+"""Keypoints per pixel above which `dense_sift` is faster than describing keypoints one by one."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
@@ -36,7 +35,7 @@ CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
 0.04. The thresholds apply to the contrast times the number of layers, as in OpenCV."""
 
 MIN_KEYPOINTS = 1000
-"""If there are fewer keypoints, the next lower contrast threshold is tried. Chosen by hand."""
+"""If there are fewer keypoints than this, the next lower threshold is tried. Chosen by hand."""
 
 ROWS_AT_ONCE = 1024
 """This many descriptors are converted to RootSIFT at a time: they stay in the processor's cache."""
@@ -69,10 +68,9 @@ def dense_sift(
     """Compute OpenCV's SIFT descriptors, (N, 128) uint8, of upright keypoints all at once.
 
     OpenCV sums the gradients around each keypoint separately. If all keypoints are upright and of
-    one size, these sums are a separable filter (bilinear times Gaussian) of the image. Positions
-    must be whole pixels inside the image, and lie only on every `step_px`-th row and column. A step
-    above 1 takes less time. The size must lie within `DENSE_SIZES_PX`. `gradient` is the result of
-    `sift_gradient` for this image; None: it is computed.
+    one size, a separable filter of the image gives these sums. Positions must be whole pixels
+    inside the image, and lie only on every `step_px`-th row and column. A step above 1 takes less
+    time. The size must lie within `DENSE_SIZES_PX`. `gradient` is the result of `sift_gradient`.
     """
     from .kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
@@ -108,11 +106,7 @@ def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of the pixels along one axis around a keypoint, and where they are not 0.
-
-    The weights, (4, T) float32, have a row for each of the four spatial bins. The second result is
-    the (4, 3) int64 `spans` of `describe_tiles`.
-    """
+    """Return the arguments `taps` and `spans` of `describe_tiles` for keypoints of this size."""
     from .kernels import TAPS_AT_ONCE
 
     width = BIN_WIDTH * size
@@ -147,9 +141,8 @@ def scaled_sift_descriptors(
 ) -> np.ndarray:
     """Compute (N, 128) uint8 SIFT descriptors of keypoints at their own sizes and angles.
 
-    Gradients are taken from the image of the scale space that is nearest to the keypoint's size, as
-    for SIFT's own keypoints. (`sift_descriptors` uses the finest image for all keypoints.) Sizes
-    are diameters, twice sigma. A descriptor covers a square with a side of six diameters.
+    As for SIFT's own keypoints, gradients come from the image of the scale space whose sigma is
+    nearest to half the size. A descriptor covers a square whose side is six times the size.
     """
     if not len(xy):
         return np.empty((0, 128), np.uint8)
@@ -229,14 +222,13 @@ def to_root_sift(descriptors: np.ndarray) -> np.ndarray:
     """Convert (N, 128) uint8 SIFT descriptors to RootSIFT, in place.
 
     RootSIFT (Arandjelovic and Zisserman, 2012) is the square root of L1-normalised descriptors,
-    here times 512 and at most 255. Its Euclidean distance is the Hellinger distance of SIFT.
+    here times 512 and at most 255. Its Euclidean distances are Hellinger distances of SIFT.
     """
     parallel_for(len(descriptors), _square_root, descriptors)
     return descriptors
 
 
 def _square_root(start: int, stop: int, descriptors: np.ndarray) -> None:
-    """Convert the SIFT descriptors `start` to `stop` (exclusive) to RootSIFT, in place."""
     roots = np.sqrt(np.arange(256, dtype=np.float32))
     for first in range(start, stop, ROWS_AT_ONCE):
         rows = descriptors[first : min(first + ROWS_AT_ONCE, stop)]
@@ -258,7 +250,7 @@ def correlation_distance(
 
     A pair is a row of `first`, (N, D), given in `rows0`, (K,), and a row of `second`, (M, D), given
     in `rows1`, (K,). `mean`, (D,) float32, is subtracted from all descriptors first. The result is
-    0 for equal descriptors, and 1 if one of them equals the mean.
+    1 if a descriptor equals the mean, and otherwise 0 for equal descriptors.
     """
     from .kernels import correlation_distances
 
@@ -283,9 +275,8 @@ def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
     The keypoints have sizes, angles and octaves. Descriptors are rotated to the keypoints' angles.
     """
     size = (gray.shape[1], gray.shape[0])
-    # SIFT runs once, with the lowest threshold, because nearly all of the time goes into the
-    # pyramid. Higher thresholds are applied below. Without precise upscaling OpenCV's positions
-    # are a quarter of a pixel off, to the right and down.
+    # SIFT runs once, as nearly all time goes into the pyramid; higher thresholds are applied below.
+    # Without precise upscaling, OpenCV's positions are off by a quarter of a pixel.
     sift = cv2.SIFT_create(
         nOctaveLayers=LAYERS,
         contrastThreshold=min(CONTRAST_THRESHOLDS),

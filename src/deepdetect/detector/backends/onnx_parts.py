@@ -1,7 +1,6 @@
 """Cutting out the part of a network in an ONNX file that lies between named tensors.
 
-Protobuf, which comes with ONNX Runtime, suffices for this, so the package `onnx` is not needed
-to run a network. Protobuf copies fields that are not declared here unchanged.
+This needs only Protobuf, not the package `onnx`. Protobuf copies undeclared fields unchanged.
 """
 
 from __future__ import annotations

@@ -83,10 +83,8 @@ def _not_started(device: str, reason: object) -> OptionError:
 
 
 def _logits_only(path: Path) -> str | bytes:
-    """Return an ONNX file reduced to its logits if it also outputs keypoints, otherwise its path.
-
-    ONNX Runtime would compute all outputs of a file, even those that are not requested.
-    """
+    """Return the path of an ONNX file or, if it also outputs keypoints, a copy without them."""
+    # ONNX Runtime would compute all outputs of a file, even those that are not requested.
     model = path.read_bytes()
     if all(name.encode() in model for name in (LOGITS, *POINTS)):
         with contextlib.suppress(KeyError):

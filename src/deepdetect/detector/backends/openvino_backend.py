@@ -21,15 +21,15 @@ from .interface import (
 )
 
 COMPILED_LAYERS = 100
-"""OpenVINO compiles layers for each image size. It caches this many of them, and drops those used
-least recently. OpenVINO's default, 5000, would fill 0.5 GB if image sizes vary."""
+"""OpenVINO compiles layers for each image size, and caches at most this many. Its default, 5000,
+would fill 0.5 GB if image sizes vary."""
 
 
 _CORES: list[Any] = []
-"""The core of OpenVINO that all models share; empty before the first model, and after memory has
-run out, because compiling in the same core would then crash. Deleting cores in the order in which
-they were made leaves the thread with a signal stack that is freed, and the next signal that Python
-handles, such as Ctrl-C, would end the process (OpenVINO 2026.4; findings/openvino_cores.sh)."""
+"""The one core of OpenVINO that all models share. If each model had a core, deleting cores could
+free the thread's signal stack, and the next signal, such as Ctrl-C, would end the process (OpenVINO
+2026.4; findings/openvino_cores.sh). The list is emptied if memory runs out, because compiling in
+the same core would then crash."""
 
 
 class OpenVinoNetwork:
@@ -46,7 +46,7 @@ class OpenVinoNetwork:
         self._model = compile_model()
         self._output_name = output_to_read([v.get_any_name() for v in self._model.outputs])
         self._path = path
-        # A network runs in tiles only in float32. Its parts are then read from `onnx_path`.
+        # Tiles, which are for float32 only, read the parts of the network from `onnx_path`.
         self.onnx_path = path if options.precision == "float32" else None
         self.threads = options.threads
         self._works = False  # whether a run has given a correct result

@@ -29,17 +29,13 @@ BACKENDS: dict[str, Callable[[Path, RuntimeOptions], Network]] = {
     "onnxruntime": open_onnxruntime,
     "openvino": open_openvino,
 }
-"""The functions with which the backends open a file, by the name of the backend, which is also that
-of the Python package that it needs."""
+"""The function of each backend that opens a file. Backends are named after Python packages."""
 
 PRECISIONS = ("float32", "bfloat16")
 
 
 def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
-    """Load weights with a suitable backend; return the network and the backend's name.
-
-    Networks are cached, and loaded again if their file has changed.
-    """
+    """Load weights, unless they are cached; return the network and the name of its backend."""
     check_name("backend", options.backend, ("auto", *BACKENDS))
     check_name("precision", options.precision, PRECISIONS)
     check_ranges(options, counts=("threads",))
@@ -67,7 +63,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 
 @functools.lru_cache(maxsize=4)
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
-    """Load and check a file, and cache the network; a file with a new `state` is loaded again."""
+    """Load and check a file, unless it is cached with the same `state` (path, time, size)."""
     network = BACKENDS[backend](path, options)
     _check_answer(network, path)
     return network

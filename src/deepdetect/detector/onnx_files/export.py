@@ -87,7 +87,7 @@ def write_onnx(
 ) -> dict[str, str]:
     """Write weights as an ONNX file for other programs, atomically; return the file's metadata.
 
-    The weights are the name of bundled ones, or an ONNX file that this package has written for any
+    `weights` are given by the name of bundled weights, or as an ONNX file of this package for any
     image size. If `licence` is None, the metadata keep the licence of the weights.
     """
     if Path(path).suffix.lower() != ".onnx":
@@ -102,7 +102,7 @@ def write_onnx(
 def write_model(
     model: ModelProto, path: str | Path, options: OnnxOptions, origin: Mapping[str, str]
 ) -> dict[str, str]:
-    """Adapt a network for any image size to `options`, and write it; return the metadata.
+    """Adapt a network that takes any image size to `options`, and write it; return the metadata.
 
     `origin` tells where the weights come from, and becomes part of the metadata.
     """

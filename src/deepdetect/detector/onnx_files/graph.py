@@ -1,7 +1,4 @@
-"""Changes to the graph of an ONNX file: padding and cropping, a fixed image size, metadata.
-
-The module needs the package `onnx` but not torch, because it makes files from other ONNX files.
-"""
+"""Changes to the graph of an ONNX file: padding and cropping, a fixed image size, metadata."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ file pad, crop and compute probabilities."""
 
 _OUTSIDE = {"shape", "sides", "minus_sides", "missing", "padding", PADDED_IMAGE}
 _OUTSIDE |= {"sigmoid", PROBABILITY, LOGITS}
-"""Names of the tensors that padding, cropping and the sigmoid compute, not the network itself."""
+"""Names of the tensors that padding, cropping and the sigmoid compute, outside the network."""
 
 METADATA = {
     "channels": "RGB",
@@ -87,10 +84,7 @@ def ending_nodes(graph: GraphProto, crop: bool = True) -> list[NodeProto]:
 
 
 def set_sides(graph: GraphProto, kind: str, **sides: str | int) -> None:
-    """Set the batch, height and width in the shapes of the image and of the maps.
-
-    `kind` is "dim_value" if they are numbers, "dim_param" if they are names.
-    """
+    """Set batch, height and width of all maps to numbers ("dim_value") or names ("dim_param")."""
     for value in (*graph.input, *graph.output):
         dimensions = value.type.tensor_type.shape.dim
         for axis, name in ((0, "batch"), (2, "height"), (3, "width")):
@@ -98,7 +92,7 @@ def set_sides(graph: GraphProto, kind: str, **sides: str | int) -> None:
 
 
 def replace_nodes(graph: GraphProto, nodes: Sequence[NodeProto]) -> None:
-    """Replace all nodes of a graph by `nodes`, and drop the weights that none of these reads."""
+    """Replace all nodes of a graph by `nodes`, and drop the weights that no node reads."""
     nodes = list(nodes)
     used = {name for node in nodes for name in node.input}
     weights = [one for one in graph.initializer if one.name in used]

@@ -1,7 +1,4 @@
-"""The keypoints of `PointDetector` as outputs of an ONNX file, computed in its graph.
-
-`tools/points_graph.py` makes the part of the graph that computes them.
-"""
+"""The keypoints of `PointDetector` as ONNX outputs; `tools/points_graph.py` makes their graph."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Features of candidate keypoints, which are the input of the ranker.
 
-They are measured relative to the candidate's own scale and strength, and hardly change if the image
-is rotated, zoomed or lit differently. So the same points rank high in both images of a pair.
+The features are relative to the candidate's own scale and strength. They hardly change if the image
+is rotated, zoomed or lit differently, so the same points rank high in both images of a pair.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ features are divided, so that noise and rounding have little effect on logarithm
 def ring_offsets() -> np.ndarray:
     """Return the offsets, in pixels, from a candidate to its P ring points: (2, L, 2, P) int64.
 
-    The first axis is x or y. The second is the candidate's level. The third tells whether its
-    column (for x) or row (for y) is even or odd. The fourth is the ring point: the first points of
-    all rings, then the second points, and so on.
+    The first axis is x or y. The second is the candidate's level. The third tells whether the
+    candidate's column (for x) or row (for y) is even or odd. The fourth is the ring point: the
+    first points of all rings, then the second points, and so on.
     """
     angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
     reach = SIGMAS_PX[:, None, None, None] * RING_RADII
@@ -43,11 +43,12 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
     The first is the scaled logarithm of |det Hessian|. The others are, in this order:
     - |det Hessian| at three neighbouring levels (one finer, two coarser), relative to the first;
     - the sign of det Hessian, which tells blobs from saddles;
-    - the trace of the Hessian, and then the gradient, at these levels and the candidate's own;
+    - the trace of the Hessian with and without its sign, at these and the candidate's own level;
+    - the squared gradient at the same four levels;
     - the grey value;
-    - the largest |det Hessian| nearby at the three levels, relative to that at the same pixel;
+    - the largest |det Hessian| nearby at the three levels, relative to the value at the pixel;
     - for each ring, mean, maximum and minimum of |det Hessian| and of the grey value, and mean and
-      maximum of the gradient;
+      maximum of the squared gradient;
     - the rank by |det Hessian|, divided by the number of pixels, and the level.
     """
     from .kernels import measure_candidates

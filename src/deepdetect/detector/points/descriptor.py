@@ -1,4 +1,4 @@
-"""The learned descriptor: a network runs on an image, and its features are sampled at keypoints."""
+"""The learned descriptor: a network computes features of the image, sampled at the keypoints."""
 
 from __future__ import annotations
 
@@ -93,10 +93,7 @@ def descriptor_type(descriptor: str | Path) -> str:
 
 @functools.cache
 def _session(path: Path, content: str, threads: int | None) -> Any:
-    """Start a session of ONNX Runtime for a file, and cache it.
-
-    `content` is the start of the file's SHA-256: if it changes, the file is loaded again.
-    """
+    """Load a file, unless it is cached with the same `content`, the start of its SHA-256."""
     try:
         session = start_session(str(path), threads)
         names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]

@@ -24,13 +24,12 @@ SPREADS = ("none", "grid", "anms")
 
 CANDIDATES_PER_KEYPOINT, MIN_CANDIDATES = 6, 8192
 """The ranker gets the candidates with the highest |det Hessian|: `CANDIDATES_PER_KEYPOINT` for each
-wanted keypoint, but at least `MIN_CANDIDATES` in all. If all keypoints are wanted, or if they are
-spread, it gets every candidate. Three candidates per keypoint would save 7 of 56 ms at 640x480, but
-would lower repeatability (within 3 px) by 0.01."""
+wanted keypoint, but at least `MIN_CANDIDATES` in all. It gets every candidate if all keypoints are
+wanted, or if keypoints are spread. Three candidates per keypoint would save 7 of 56 ms at 640x480,
+but would lower repeatability (within 3 px) by 0.01."""
 
 TILE_PX = 32
-"""Side of the square image tiles in which candidates of all scales are processed together, so that
-their pixels stay in the processor's cache. Chosen by hand."""
+"""Candidates are processed in square tiles of this side, which fit in the cache. Chosen by hand."""
 
 GRID_CELLS = 16
 """Number of grid cells along the longer side of the image if `spread` is "grid". Chosen by hand."""
@@ -40,10 +39,10 @@ DISTANCE_PX = 2.0
 
 DISTANCE_PER_SIGMA = 1.0
 """Minimum distance between two keypoints, in sigmas of the smaller one, so that one structure is
-not found at several scales. It raised the ranker's score on photos/val from 0.539 to 0.543."""
+not found at several scales. This raised the ranker's score on photos/val from 0.539 to 0.543."""
 
 SIZE_PER_SIGMA = 2.5
-"""Diameter of a keypoint, for descriptors, divided by the sigma of its scale. Chosen by hand."""
+"""Diameter at which a keypoint is described, divided by the sigma of its scale. Chosen by hand."""
 
 
 def least_distances(sigma_px: np.ndarray) -> np.ndarray:
@@ -62,8 +61,7 @@ def detect_points(
 ) -> Keypoints:
     """Detect keypoints of all scales in a (H, W) uint8 image, best first, as in `PointDetector`.
 
-    The logits are the outputs of the ranker. The scores are made from them: they lie in (0, 1), all
-    differ, and have the same order.
+    The logits come from the ranker. `ranking_scores` turns the logits into scores.
     """
     # Spreading needs all candidates: the strongest ones do not lie in regions of low contrast.
     limit = max_keypoints if spread == "none" else None
@@ -103,7 +101,7 @@ def rank_candidates(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
     rows = rows[:strongest]
-    # In the order of tiles, candidates of all scales use the same pixels in the cache.
+    # Sorted by tiles, successive candidates of all scales use the same pixels in the cache.
     tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
     candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
     return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))

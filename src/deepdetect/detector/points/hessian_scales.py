@@ -28,8 +28,8 @@ class ScaleSpace:
     """Smoothed copies of an image with values in [0, 1], and the determinants of their Hessians.
 
     `smooth` holds the copies, `determinant` the scale-normalised determinants, (L, H, W) float32
-    each. `gray` is the mean of the image, rounded to a whole grey level (a multiple of 1/255). It
-    has been subtracted from `smooth`.
+    each. `gray` is the mean of the image, rounded to a multiple of 1/255. `smooth` holds the
+    differences from this mean.
     """
 
     gray: np.float32
@@ -45,7 +45,7 @@ class Candidates:
         level, row, column: (N,) int64 level of the scale space, and pixel in it.
         xy: (N, 2) float64 sub-pixel positions in the image.
         sigma_px: (N,) float64 sigmas of the candidates' levels.
-        rank: (N,) int64 ranks by |det Hessian| sigma^4 in all levels; 0 is the strongest.
+        rank: (N,) int64 ranks by scale-normalised |det Hessian|; 0 is the strongest of all levels.
     """
 
     level: np.ndarray
@@ -84,8 +84,7 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
 def find_candidates(space: ScaleSpace) -> Candidates:
     """Find the maxima of |det Hessian| in each level except the finest and the two coarsest.
 
-    Positions are refined by parabolas in x and y. No maxima are searched in the outermost
-    rows and columns.
+    Positions are refined by parabolas in x and y. The outermost pixels are not searched.
     """
     pixels, positions, strengths = [], [], []
     window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)

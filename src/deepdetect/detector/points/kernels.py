@@ -19,8 +19,8 @@ _POINTS = RINGS * RING_POINTS
 def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def]
     """Compute the determinant of the scale-normalised Hessian of a smoothed (H, W) float32 image.
 
-    `variance` is that of the Gaussian that smoothed it. The derivatives are central differences.
-    Beyond its outermost pixels, the image is mirrored. The result is written into `determinant`.
+    `variance` is the variance of the Gaussian that smoothed the image. Derivatives are central
+    differences; the image is mirrored at its border. The result is written into `determinant`.
     """
     height, width = smooth.shape
     scale = variance * variance
@@ -31,7 +31,7 @@ def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def
         above1, above2, here1, here2 = above[1:], above[2:], here[1:], here[2:]
         below1, below2, inner = below[1:], below[2:], out[1:]
         for x in range(width - 2):
-            # Subtracting in this order keeps values small, and so the rounding errors.
+            # Subtracting in this order keeps values, and therefore rounding errors, small.
             double = np.float32(2) * here1[x]
             xx, yy = (here[x] - double) + here2[x], (above1[x] - double) + below1[x]
             xy = (below2[x] - below[x]) - (above2[x] - above[x])
@@ -77,8 +77,8 @@ def measure_candidates(  # type: ignore[no-untyped-def]
     steps, values = np.empty((3, _POINTS), np.int64), np.empty((3, _POINTS), np.float32)
     places, right, down = steps[0], steps[1], steps[2]
     response, slope, light = values[0], values[1], values[2]
-    # `logs` holds, in this order: |det Hessian| of the candidate, then at three neighbouring
-    # scales, its maxima there, the squared gradients at four scales, and values of the rings.
+    # `logs` holds |det Hessian| at the candidate and at three neighbouring scales, the maxima of
+    # |det Hessian| nearby at these three, squared gradients at four scales, and ring values.
     logs, bent = np.empty(11 + 7 * RINGS, np.float32), np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
         level, row, column = candidates[n, 0], candidates[n, 1], candidates[n, 2]

@@ -21,10 +21,10 @@ _CHUNK = 2048
 
 @dataclass(frozen=True, eq=False)
 class Ranker:
-    """Weights of the ranker, a multilayer perceptron whose input is the features of a candidate.
+    """Weights of the ranker, a multilayer perceptron on the features of candidates.
 
-    The logit of a candidate is its first feature plus the output of the perceptron. `mean` and
-    `deviation` normalise the features first. Each of the `layers` has weights (outputs, inputs) and
+    The logit of a candidate is its first feature plus the output of the perceptron, whose input is
+    normalised by `mean` and `deviation`. Each of the `layers` has weights (outputs, inputs) and
     biases, with ReLU between the layers.
     """
 
