@@ -89,8 +89,7 @@ def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
 
 
 TOLERANCE_PX = 1.0
-"""A match is correct if its distance from the ground truth is at most this, as in Middlebury's
-evaluation."""
+"""A match is correct within this distance of the ground truth, as in Middlebury's evaluation."""
 
 
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:
