@@ -285,7 +285,7 @@ def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
 def fundamental_matrix(
     calibration: Calibration, rotation: np.ndarray, translation: np.ndarray
 ) -> np.ndarray:
-    """Return the (3, 3) F with x1^T F x0 = 0 in pixels; X1 = rotation @ X0 + translation is the pose."""
+    """Return (3, 3) F for X1 = rotation @ X0 + translation: x1^T F x0 = 0 for matches in pixels."""
     essential = cross_matrix(translation) @ rotation
     inverse0 = np.linalg.inv(calibration.camera0.matrix)
     return np.linalg.inv(calibration.camera1.matrix).T @ essential @ inverse0

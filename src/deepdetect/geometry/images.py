@@ -157,11 +157,7 @@ def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
 
 
 def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
-    """Subtract the mean of the window around each pixel and divide by its standard deviation.
-
-    Returns (H, W) float32. The ZNCC of two images in a window is approximately the mean of the
-    product of their normalised images over this window.
-    """
+    """Normalise each pixel by the mean and deviation of the window around it, (H, W) float32."""
     window = (WINDOW_PX, WINDOW_PX)
     values = gray.astype(np.float32)
     mean = cv2.boxFilter(values, cv2.CV_32F, window)

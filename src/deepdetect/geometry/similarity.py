@@ -141,7 +141,7 @@ def fit_similarity(
         weighted = jacobian * weights[:, None, None]
         of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
         right = np.einsum("nai,na->i", weighted, residuals / stds)
-        # Level directions should have z = 0. Deviating ones get less weight, as some images are
+        # Level directions should have z = 0. Others get less weight, because some images are
         # tilted.
         seen = level @ current.rotation.T
         errors = seen[:, 2] / level_stds

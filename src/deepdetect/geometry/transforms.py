@@ -73,11 +73,7 @@ def signed_epipolar_errors(
 
 
 def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Multiply (N, 2) points, as columns (x, y, 1), by a matrix of three columns.
-
-    Returns a list with one (N,) array for each row of the matrix. Each is computed by itself,
-    because a matrix product takes several times as long.
-    """
+    """Multiply points (x, y, 1) by each row of a matrix; this is faster than a matrix product."""
     x, y = points[:, 0], points[:, 1]
     coordinates = []
     for row in matrix:

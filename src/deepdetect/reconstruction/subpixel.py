@@ -4,7 +4,7 @@ The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 yea
 independent of the gain and offset of the brightness. Each patch is aligned twice. First it is
 warped by a similarity that is fitted to all matches, then by an affinity that is fitted to the
 refined matches around it. On Middlebury's Motorcycle, 65 % of the converged matches were within
-0.25 px of the ground truth. With a parabola through the correlation instead, 49 % were.
+0.25 px of the ground truth.
 """
 
 from __future__ import annotations
@@ -37,14 +37,13 @@ AFFINITY_WINDOW_PX = 15
 
 AFFINITY_REGULARIZATION = 20.0
 """When an affinity is fitted to the matches in a window, the similarity of all matches counts as
-much as this number of matches spread over the window. An affinity that is fitted to few matches, or
-to matches on one line, is therefore close to the similarity. Chosen by hand."""
+much as this number of matches, in case the matches are few or on one line. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES = 5000
 """The similarity is estimated from at most this number of matches, to save time."""
 
 CORNER_WINDOW_PX = 7
-"""The strength of a corner is measured in a window with this side, about that of a patch."""
+"""Strengths of corners are measured in a window with this side, about the side of a patch."""
 
 
 def refine_matches(
@@ -150,8 +149,8 @@ def align_patches(
     """Align patches of the first image, each warped by its affinity, to the second image.
 
     The images are (H, W) float32. `pixels0` are the centres of the patches, (N, 2) int64, `start`
-    their initial positions in the second image, (N, 2) float64, and `affinities` is (N, 2, 2). The
-    patches are divided among threads. Returns the same as `refine_matches`.
+    their initial positions in the second image, (N, 2) float64, and `affinities` is (N, 2, 2).
+    Returns the same as `refine_matches`.
     """
     from .subpixel_kernel import align
 
