@@ -208,7 +208,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _kitti(values: Values, views: tuple[int, int] | None) -> dict[str, Any] | None:
-    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw); 2 and 3 are colour cameras."""
+    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw), by default 2 and 3."""
     for start in ("P", "P_rect_0"):
         for pair in (views or (2, 3), (2, 3), (0, 1)):
             left, right = (_matrix(values, [f"{start}{view}"], 12) for view in pair)

@@ -341,7 +341,7 @@ class Parallax:
     the predicted position along a line through the epipole (Chum, Werner and Matas, "Two-view
     geometry estimation unaffected by a dominant plane", 2005). Wrong matches are displaced in any
     direction, except for a few in one direction on a repeated pattern. `log10_nfa` is the log10 of
-    the number of false alarms of the epipole.
+    the number of false alarms of the agreement on the epipole.
     """
 
     on_plane: int

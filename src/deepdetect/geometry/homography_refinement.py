@@ -32,8 +32,8 @@ from .images import (
 from .transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
-"""For each round: side of the tracked windows in pixels, maximum number of corners, and number of
-pyramid levels. Corners move farther in the first round. Chosen by hand."""
+"""Each round has a side of the tracked windows in pixels, a maximum number of corners, and a number
+of pyramid levels. Corners move farther in the first round. Chosen by hand."""
 
 MIN_TRACKS = 15
 """A homography is fitted only if there are at least this many tracks. Chosen by hand."""
@@ -73,8 +73,8 @@ returns None if the fit fails."""
 def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Refine the homography from the first of two grey images to the second.
 
-    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. The result
-    is scaled so that its last element is 1. It is otherwise unchanged if no step improves it.
+    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. The last
+    element of the result is 1. If no step improves the homography, only its scale changes.
     """
     size = (gray0.shape[1], gray0.shape[0])
     blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)
@@ -91,7 +91,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
     steps.append(partial(_fit_to_pixels, gray0))
     current = np.asarray(homography, np.float64)
     for step in steps:
-        # Tracking needs detail that linear interpolation loses, so only the last step uses it.
+        # Linear interpolation loses detail that tracking needs. Only the last step does not track.
         warp = partial(warp_to_reference, exact=step is steps[-1])
         warped, valid_mask = warp(gray1, current, size)
         fit = step(warped, valid_mask)
@@ -134,8 +134,8 @@ def _fit_to_corners(
 ) -> Fit:
     """Track corners, and return a function that fits a homography to those in a part of the image.
 
-    The fit is by weighted least squares. With lens distortion, no homography fits the whole image,
-    and RANSAC would give a different result for each random sample.
+    The fit is by weighted least squares, because RANSAC gives a different result for each random
+    sample if no homography fits the whole image, for example due to lens distortion.
     """
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
@@ -227,9 +227,9 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
 def _halves(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Divide an image of (width, height) into the squares of a chessboard.
 
-    Returns two bool masks. The first, (H, W), is True for pixels on squares of one colour.
-    The second, (H // STEP_PX, W // STEP_PX), is True for those windows of `local_zncc` that lie
-    within one square, with a margin for the blur.
+    Returns two bool masks. The first, (H, W), is True for pixels on squares of one colour. The
+    second, (H // STEP_PX, W // STEP_PX), is True for those windows of `local_zncc` that lie within
+    one square, with a margin for the blur.
     """
     margin = WINDOW_PX // 2 + int(np.ceil(3 * BLUR_SIGMA_PX))
     side = max(max(size) / SQUARES, 4 * margin)

@@ -157,7 +157,7 @@ def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
 
 
 def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
-    """Normalise each pixel by the mean and deviation of the window around it, (H, W) float32."""
+    """Subtract each window's mean and divide by its standard deviation; return (H, W) float32."""
     window = (WINDOW_PX, WINDOW_PX)
     values = gray.astype(np.float32)
     mean = cv2.boxFilter(values, cv2.CV_32F, window)
@@ -296,8 +296,7 @@ scaled so that their quantile EDGE_QUANTILE becomes white (255). Both were chose
 def edge_strength(gray: np.ndarray) -> np.ndarray:
     """Return the length of the gradient of an (H, W) uint8 luma image, scaled to uint8.
 
-    The result does not depend on which side of an edge is brighter, so images of different sensors,
-    whose tones may be inverted, look alike.
+    The result is the same for inverted tones, so that images of different sensors look alike.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
     length = np.hypot(cv2.Scharr(smooth, -1, 1, 0), cv2.Scharr(smooth, -1, 0, 1))

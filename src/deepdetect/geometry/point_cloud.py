@@ -24,7 +24,7 @@ BOX_PERCENTILE = 1.0
 """This percentage of the points lies beyond each face of the robust box. Chosen by hand."""
 
 MAX_ANGULAR_SPACING = 0.02
-"""Maximum result of `angular_spacing` in radians, so that points stay small. Chosen by hand."""
+"""Maximum of `angular_spacing` in radians; it limits the size of drawn points. Chosen by hand."""
 
 
 @suggest_keywords

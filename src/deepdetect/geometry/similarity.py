@@ -27,8 +27,7 @@ at most this angle, because three points that lie nearly on a line can give any 
 
 MIN_AREA_POINTS, MIN_AREA = 8, 0.2
 """The points can overrule the known upward direction only if there are at least MIN_AREA_POINTS,
-and their spread along the second principal axis is above MIN_AREA times that along the first.
-Chosen by hand."""
+and their second principal axis is above MIN_AREA times as long as the first. Chosen by hand."""
 
 MUCH_BETTER = 0.5
 """The known upward direction is overruled only if tilting it by more than `MAX_START_TILT_DEG`
@@ -141,8 +140,7 @@ def fit_similarity(
         weighted = jacobian * weights[:, None, None]
         of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
         right = np.einsum("nai,na->i", weighted, residuals / stds)
-        # Level directions should have z = 0. Others get less weight, because some images are
-        # tilted.
+        # Level directions should have z = 0. Others get less weight, as some images are tilted.
         seen = level @ current.rotation.T
         errors = seen[:, 2] / level_stds
         rows = np.zeros((len(level), 7))

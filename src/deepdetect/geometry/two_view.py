@@ -25,8 +25,8 @@ from .semi_calibrated import START_FOCAL_LENGTHS, estimate_semi_calibrated
 from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
-"""Inlier thresholds in pixels of the models that guide matching. The models are fitted to keypoints
-of reduced copies of the images, which are less accurate."""
+"""Inlier thresholds in pixels of the models that guide matching. These models are fitted to less
+accurate keypoints, from reduced copies of the images."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
 """Inlier thresholds in pixels of the models by which a scene is classified. Chosen on Oxford,
@@ -55,7 +55,7 @@ clearly off the plane. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MIN_FOREGROUND_ON_LINES = 0.8
 """There is a foreground only if at least this fraction of the matches clearly off the plane are
-inliers of the fundamental matrix. On sixteen planar pairs of Oxford, it is at most 0.65."""
+inliers of the fundamental matrix. On 16 planar pairs of Oxford, the fraction is at most 0.65."""
 
 
 def fit_model(
@@ -87,9 +87,9 @@ def choose_model(
 
     `model` is "homography", "fundamental" or "auto". For "auto", a trusted homography is returned
     unless the other matches show depth. Otherwise the fundamental matrix is returned if it is
-    trusted or has fewer false alarms than the homography. With `semi_calibrated`, it may come from
-    `estimate_semi_calibrated`, which needs fewer correct matches but more time. The caller must
-    check whether the result is `trusted`.
+    trusted or has fewer false alarms than the homography. With `semi_calibrated`, the fundamental
+    matrix may come from `estimate_semi_calibrated`, which needs fewer correct matches but more
+    time. The caller must check whether the result is `trusted`.
     """
     plane = TwoViewModel("none", None, np.zeros(len(points0), bool), float("inf"))
     if model != "fundamental":

@@ -19,7 +19,7 @@ FLANN_INDEX_KDTREE_SINGLE = 4
 """FLANN's code for an index with a single kd-tree, which is exact in few dimensions."""
 
 SOR_DISPARITY_WEIGHT = 2.0
-"""In `disparity_space`, a difference of one pixel in disparity counts as much as this number of
+"""A difference of one pixel in disparity counts as much in `disparity_space` as this number of
 pixels in x or y. Chosen by hand."""
 
 QUERIES = 200_000
@@ -65,10 +65,7 @@ def sor_inliers(
 
 
 def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
-    """Return the mean distance of each point to its nearest neighbours, (N,) float64.
-
-    The points are (N, 3) and must be finite.
-    """
+    """Return the (N,) mean distances of finite (N, 3) points to their nearest neighbours."""
     points = np.asarray(points, np.float64)
     centred = np.ascontiguousarray(points - points.mean(0), np.float32)
     count = min(neighbors + 1, len(points))

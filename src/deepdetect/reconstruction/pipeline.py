@@ -46,10 +46,9 @@ SOR_WINDOW_PX = 9
 window with this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
-"""Minimum fractions of keypoints with a match on their row. If matches must be unique, the minimum
-is MIN_UNIQUE_FRACTION: unrelated images had up to 0.005, and rectified pairs at least 0.35.
-Otherwise it is MIN_MATCHED_FRACTION: unrelated images had up to 0.16, and rectified pairs at least
-0.64."""
+"""Minimum fractions of keypoints with a match on their row. MIN_UNIQUE_FRACTION is used if matches
+must be unique: unrelated images had up to 0.005, and rectified pairs at least 0.35. Otherwise
+MIN_MATCHED_FRACTION is used: unrelated images had up to 0.16, rectified pairs at least 0.64."""
 
 
 @suggest_keywords

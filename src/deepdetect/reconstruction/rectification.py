@@ -1,8 +1,7 @@
 """Recognise rectified pairs, and check that the calibration fits and that they show depth.
 
 The matches of a rectified pair lie on the same row in both images. A pair is rectified if about as
-many matches do so as fit the best fundamental matrix, or the best rows that are shifted, tilted and
-scaled.
+many matches do so as fit a fundamental matrix, or rows that are shifted, tilted and scaled.
 """
 
 from __future__ import annotations
@@ -49,8 +48,7 @@ MIN_COARSE_INLIERS = 50
 
 MAX_COARSE_ROW_ERROR_PX = 0.6
 """The coarse pass accepts a pair as rectified only if its `_row_error`, in pixels of the full
-images, is below this. The limit can be below 1, because all matches together determine that
-error."""
+images, is below this. Many matches determine this error, so the limit can be below 1."""
 
 MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
 """The focal lengths of rectified views may differ by at most this fraction, so that values rounded
@@ -82,15 +80,15 @@ rotation, divided by that under the best plane, is below this. The ratio was up 
 views, and at least 5.3 for slanted walls."""
 
 MAX_OFF_ROW_PX = 1.0
-"""Disparities come from matches on the same row, so a rotation cannot explain them if the median
-distance by which it moves points off their rows is above this."""
+"""A rotation cannot explain disparities, which come from matches on the same row, if it moves
+points off their rows by a median distance above this."""
 
 ROBUST_ITERATIONS = 12
 
 ROTATION_GRID_SIZE_PX, MIN_ROTATION_MATCHES, MAX_ROTATION_SAMPLES = 16, 30, 50_000
-"""From at most MAX_ROTATION_SAMPLES random disparities, one per cell with the side
-ROTATION_GRID_SIZE_PX is used. A rotation is fitted to at least MIN_ROTATION_MATCHES of them. Chosen
-by hand."""
+"""A rotation is fitted to one disparity per cell with the side ROTATION_GRID_SIZE_PX, if there are
+at least MIN_ROTATION_MATCHES. At most MAX_ROTATION_SAMPLES random disparities are considered.
+Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ class Rectification:
         reason: why the pair is not rectified; empty if it is.
         swapped: whether the pair is rectified, but left and right are exchanged.
         on_rows: number of `matches` whose rows in the two images differ by at most one pixel.
-        by_fundamental: number of matches that a fundamental matrix explains as accurately.
+        by_fundamental: number of matches that a fundamental matrix explains with that tolerance.
         by_other_rows: number of matches that rows explain if these may be shifted, tilted and
             scaled between the images.
         matches: number of matches that were used, one per cell of the left image.
@@ -178,9 +176,9 @@ def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
     """Return the `MIN_INLIER_RATIO` quantile of the row errors of a pair that looks rectified.
 
     The row error is how many pixels the rows of the two images are off at a position. A single
-    match is too inaccurate, so a smooth function is fitted to the differences of all matches. It
-    depends on the position, for rotated views and lens distortion, and on the disparity, for a
-    camera that also moved up or down.
+    match is too inaccurate, so a smooth function is fitted to y1 - y0 of all matches. It depends on
+    the position, for rotated views and lens distortion, and on the disparity, for a camera that
+    also moved up or down.
     """
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
@@ -310,10 +308,10 @@ def check_pure_rotation(
 ) -> None:
     """Raise a NoDepthError if a rotation explains the disparities far better than a plane does.
 
-    To first order, a rotation by an angle a about the vertical moves pixels along their rows by
-    f a (1 + x^2), where f is the focal length and x the horizontal slope of the ray. So the
-    disparities are like those of a wall, but curved. The rotation is not noticed if f is far off,
-    if the camera was also tilted, or if the curvature is smaller than the noise.
+    To first order, a rotation about the vertical by an angle a moves pixels by f a (1 + x^2) along
+    their rows, where f is the focal length and x the horizontal slope of the ray. Disparities of a
+    plane lack this curvature. The rotation is not noticed if f is far off, if the camera was also
+    tilted, or if the noise hides the curvature.
     """
     chosen = np.arange(len(pixels))
     if len(chosen) > MAX_ROTATION_SAMPLES:

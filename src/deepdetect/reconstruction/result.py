@@ -39,9 +39,8 @@ class Reconstruction:
         disparity: (N,) float32 in pixels for rectified pairs, else None. The match of (x, y) in
             the left image is (x - disparity, y) in the right image.
         matched: (N,) bool, True for points that were matched in both images. The others are hidden
-            in the right image or at the edge of an occluding surface, and got the depth of a
-            surface next to them. They exist only if every pixel of a rectified pair becomes a
-            point.
+            in the right image or at the edge of an occluding surface. They got the depth of an
+            adjacent surface, and exist only if every pixel of a rectified pair becomes a point.
         unit: "mm" if the baseline is known. Otherwise "baseline": the distance between the cameras
             is 1, and the true scale is not known.
         size: (width, height) of the left image.

@@ -31,14 +31,14 @@ MAX_REPROJECTION_ERROR_PX = 0.5
 """Maximum root mean square reprojection error of a point in both images. Chosen by hand."""
 
 POSE_CELLS = 10_000
-"""The pose is estimated from the best corners of about this number of cells. Chosen by hand."""
+"""The pose is estimated from the best corner in each of about this many cells. Chosen by hand."""
 
 GRID_SIZE_PX = 16
 """The first image is divided into cells with this side. The checks use one match from each cell,
 because neighbouring matches are not independent evidence. Chosen by hand."""
 
 MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
-"""A pose explains a match if its Sampson distance is below this, as for a fundamental matrix."""
+"""A pose explains a match if the Sampson distance is below this, as for a fundamental matrix."""
 
 MIN_POSE_RATIO = 0.75
 """A pose is accepted only if it explains at least this fraction of the number of matches that the
