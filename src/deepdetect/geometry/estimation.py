@@ -41,7 +41,7 @@ epipole to the position predicted by the homography. Chosen like `MIN_PARALLAX_P
 
 MIN_FRACTION_OF_PLANE = 0.2
 """A scene has depth only if the number of matches that agree on an epipole is at least this
-fraction of the number on the plane. Moved objects have fewer. Chosen like `MIN_PARALLAX_PX`."""
+fraction of the number on the plane. Moved objects give fewer. Chosen like `MIN_PARALLAX_PX`."""
 
 MIN_FRACTION_OF_REST = 0.5
 """The matches off the plane show that a scene has depth only if at least this fraction of them
@@ -425,7 +425,7 @@ def measure_parallax(
 
 
 def _misses(epipoles: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the (E, N) distances of points from the lines through epipoles and predictions."""
+    """Return the (E, N) distances of `second` from the lines through epipoles and `first`."""
     x, y, scale = epipoles.T[:, :, None]
     normal = np.hypot(y - scale * first[:, 1], scale * first[:, 0] - x)
     return np.abs(epipoles @ np.cross(first, second).T) / np.maximum(normal, 1e-12)

@@ -70,7 +70,7 @@ def warp_bands(
     """Warp an image of C bands, (H, W, C) of any type of number, as `warp_to_reference` does.
 
     A pixel has no data if any of its bands has the value `no_data`. Pixels of the result that
-    depend on such a pixel, or lie outside the image, become `no_data`, or 0 if it is None.
+    depend on such a pixel, or lie outside the image, become `no_data`, or 0 if that is None.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:

@@ -1,7 +1,7 @@
 """Fit a similarity robustly to points that are known in two frames, to georeference a model.
 
 A least-median-of-squares search finds a similarity on which most points agree. Gauss-Newton with
-Huber's weights then refines it, using all points and directions that are known to be horizontal.
+Huber's weights then refines it, using all points, and directions that are known to be horizontal.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ class Rectification:
         on_rows: number of `matches` whose rows in the two images differ by at most one pixel.
         by_fundamental: number of matches that a fundamental matrix explains with that tolerance.
         by_other_rows: number of matches that rows explain if these may be shifted, tilted and
-            scaled between the images.
+            scaled.
         matches: number of matches that were used, one per cell of the left image.
         vertical_offset: median of y in the second image minus y in the first, in pixels, of the
             matches that the fundamental matrix explains; NaN if there are none.
@@ -217,7 +217,7 @@ def detect_rectification(
     )
     best = max(by_fundamental, by_other_rows)
     reason = ""
-    # For rows, which need no samples, the NFA of a fundamental matrix is stricter than necessary.
+    # Rows are not fitted to samples, so the NFA of a fundamental matrix is a stricter test.
     if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     elif on_rows_count < MIN_INLIER_RATIO * best:
