@@ -101,8 +101,7 @@ class Rectification:
         swapped: whether the pair is rectified, but left and right are exchanged.
         on_rows: number of `matches` whose rows in the two images differ by at most one pixel.
         by_fundamental: number of matches that a fundamental matrix explains with that tolerance.
-        by_other_rows: number of matches that rows explain if these may be shifted, tilted and
-            scaled.
+        by_other_rows: number of matches that fit rows that are shifted, tilted and scaled.
         matches: number of matches that were used, one per cell of the left image.
         vertical_offset: median of y in the second image minus y in the first, in pixels, of the
             matches that the fundamental matrix explains; NaN if there are none.
