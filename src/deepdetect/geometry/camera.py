@@ -10,8 +10,7 @@ Focal lengths and positions are in pixels, and the centre of the first pixel is 
      "disparity_offset_px": 66.7,   cx right minus cx left; default: computed from the values of cx
      "left": {...}, "right": {...}} values for one view only: focal_px, cx, cy, width, height
 
-Without `baseline_mm`, lengths are in multiples of the baseline. Other keys are ignored. In the
-files of Middlebury 2014 the disparity offset is called `doffs`.
+Without `baseline_mm`, lengths are in multiples of the baseline. Other keys are ignored.
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ from .transforms import outer_corners
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
-"""A camera file may state the disparity offset as well as cx of the two cameras. The offset may
-then differ from cx of the right camera minus cx of the left by at most this. Chosen by hand."""
+"""Maximum difference of a stated disparity offset from cx right minus cx left. Chosen by hand."""
 
 
 @suggest_keywords
@@ -47,7 +45,7 @@ class Camera:
         centre: principal point (cx, cy) in pixels. None means the middle of the image.
 
     Attributes:
-        size, focal_px, centre: the same values; each is a pair.
+        size, focal_px, centre: the values of the arguments, each as a pair.
 
     Raises:
         ReconstructionError: a value is not finite or not positive.
@@ -114,7 +112,7 @@ class Calibration:
 
     Attributes:
         camera0, camera1: cameras of the left (first) and the right (second) image.
-        baseline_mm: distance between their centres. If None, the unit of depth is the baseline.
+        baseline_mm: distance between the camera centres. If None, depths are in baselines.
         source: where the calibration comes from, such as "calib.json", "focal_px" or "EXIF".
 
     Raises:
@@ -151,14 +149,14 @@ class Calibration:
     def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
         """Return the depths that belong to disparities of a rectified pair.
 
-        depth = focal length * baseline / (disparity + offset). The depth is in mm, or in units of
-        the baseline if `baseline_mm` is None.
+        depth = focal length * baseline / (disparity + `disparity_offset_px`). Depths are in mm, or
+        in baselines if `baseline_mm` is None.
 
         Args:
             disparity_px: x in the left image minus x in the right image, an array of any shape.
 
         Returns:
-            float64 depths of the same shape; infinite where disparity plus offset is not positive.
+            float64 depths of the same shape; infinite where disparity + offset is not positive.
         """
         moved = numbers_of("disparity_px", disparity_px, np.float64) + self.disparity_offset_px
         baseline = 1.0 if self.baseline_mm is None else self.baseline_mm
@@ -287,7 +285,7 @@ def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
 def fundamental_matrix(
     calibration: Calibration, rotation: np.ndarray, translation: np.ndarray
 ) -> np.ndarray:
-    """Return F, (3, 3), with x1^T F x0 = 0 in pixels, for X1 = rotation @ X0 + translation."""
+    """Return (3, 3) F for X1 = rotation @ X0 + translation: x1^T F x0 = 0 for matches in pixels."""
     essential = cross_matrix(translation) @ rotation
     inverse0 = np.linalg.inv(calibration.camera0.matrix)
     return np.linalg.inv(calibration.camera1.matrix).T @ essential @ inverse0
@@ -300,7 +298,7 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def angles_between(vectors0: np.ndarray, vectors1: np.ndarray) -> np.ndarray:
-    """Return the (N,) angles in radians between (N, 3) vectors; small ones are accurate as well."""
+    """Return the (N,) angles in radians between (N, 3) vectors; small angles are also accurate."""
     across = np.linalg.norm(np.cross(vectors0, vectors1), axis=1)
     return np.asarray(np.arctan2(across, np.einsum("ij,ij->i", vectors0, vectors1)))
 

@@ -1,7 +1,6 @@
 """Readers of camera files of other programs. A format is recognised by the content of the file.
 
 All readers return a dictionary with the keys of calib.json, which the module `camera` describes.
-docs/files.md lists the formats.
 """
 
 from __future__ import annotations
@@ -23,9 +22,8 @@ STEREO = (
     *(("P1", "P2", ""), ("M1", "M2", "D"), ("K1", "K2", "D")),
     ("cameraMatrix1", "cameraMatrix2", "distCoeffs"),
 )
-"""Keys in OpenCV's files. Each row has the keys of the two camera matrices, and the beginning of
-the keys of their distortion coefficients, which end with 1 and 2. The first row is for projection
-matrices of rectified views, which have no distortion."""
+"""Keys in OpenCV's files. A row has the keys of the left and the right camera matrix, and those of
+the distortion coefficients without the final 1 or 2. The first row is for rectified views."""
 
 MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "M1", "K1", "cameraMatrix1")
 PROJECTIONS = ("projection_matrix", "P", "p")
@@ -82,11 +80,7 @@ def read_camera_file(path: Path, views: tuple[int, int] | None = None) -> dict[s
 
 
 def _parsed(content: bytes) -> Values:
-    """Parse the content of a camera file into a mapping from keys to values.
-
-    `cv2.FileStorage` is not used for OpenCV's files, because it hangs on damaged files, and deep
-    nesting makes it crash the process.
-    """
+    """Parse a camera file, without `cv2.FileStorage`, which hangs or crashes on damaged files."""
     text = content.decode("utf-8", "replace").lstrip("\ufeff \r\n\t")
     if text.startswith("{"):
         return json.loads(text)
@@ -126,7 +120,7 @@ def _xml_values(node: ElementTree.Element) -> Any:
 
 
 def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | None:
-    """Return the first value with an allowed number of elements, as three rows, or else None."""
+    """Return the first value at `keys` whose size is in `sizes`, as three rows, or else None."""
     for key in keys:
         value = values.get(key)
         data = value.get("data") if isinstance(value, Mapping) else value
@@ -136,8 +130,7 @@ def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | No
 
 
 NO_PINHOLES = "fisheye", "equidistant", "equirectangular"
-"""A camera model whose name contains one of these words is not a pinhole model, even if all of its
-distortion coefficients are 0."""
+"""Camera models with one of these words in their name are rejected, even without distortion."""
 
 
 def _check_distortion(value: Any, model: Any) -> None:
@@ -215,7 +208,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _kitti(values: Values, views: tuple[int, int] | None) -> dict[str, Any] | None:
-    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw); 2 and 3 are in colour."""
+    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw), by default 2 and 3."""
     for start in ("P", "P_rect_0"):
         for pair in (views or (2, 3), (2, 3), (0, 1)):
             left, right = (_matrix(values, [f"{start}{view}"], 12) for view in pair)
@@ -256,7 +249,7 @@ def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _opencv(values: Values, _: Any) -> dict[str, Any] | None:
-    """Read a file of OpenCV or ROS; if it has distortion, it also needs rectified projections."""
+    """Read a file of OpenCV or ROS. If it has distortion, it also needs rectified projections."""
     for first, second, distortion in STEREO:
         left, right = (_matrix(values, [key], 9, 12) for key in (first, second))
         if left is not None and right is not None:

@@ -1,12 +1,11 @@
 """Rectify two views by their fundamental matrix, so that epipolar lines become rows.
 
-There are two kinds of rectified frames, for two kinds of motion. `PlanarFrame` warps each view by a
-homography (Hartley, "Theory and practice of projective rectification", 1999). It suits cameras side
-by side. `PolarFrame` has one row for each direction from the epipole (Pollefeys, Koch and Van Gool,
-"A simple and efficient rectification method for general motion", 1999). It also works if the
-epipole lies in the image. Its columns are spaced by the logarithm of the distance from the epipole.
-If a camera moves forward, the image is magnified about the epipole, and in this frame a
-magnification by a factor is a shift by a number of columns.
+`PlanarFrame` warps each view by a homography (Hartley, "Theory and practice of projective
+rectification", 1999). It suits cameras side by side. `PolarFrame` has one row for each direction
+from the epipole (Pollefeys, Koch and Van Gool, "A simple and efficient rectification method for
+general motion", 1999). It also works if the epipole lies in the image. Its columns are spaced by
+the logarithm of the distance from the epipole, so that the magnification by a forward motion
+becomes a shift of columns.
 
 In both frames the match of (x, y) in the first rectified view is (x - disparity, y) in the second.
 """
@@ -25,17 +24,15 @@ Both = tuple[np.ndarray, np.ndarray]
 
 MAX_STRETCH = 2.0
 """A planar frame may enlarge or reduce any part of a view by at most this factor, relative to the
-middle of the matches. The factor holds parallel to the line that is mapped to infinity; across this
-line its square is allowed. A view that needs a larger factor gets a polar frame. Chosen on Oxford,
-Middlebury, Strecha's fountain and KITTI."""
+median match and measured parallel to the line that is mapped to infinity. A view that needs a
+larger factor gets a polar frame. Chosen on Oxford, Middlebury, Strecha's fountain and KITTI."""
 
 MAX_AREA = 3.0
 """Maximum area of a planar frame, relative to the larger view. Chosen like `MAX_STRETCH`."""
 
 RESOLVED_QUANTILE = 0.6
-"""A polar frame has the resolution of the first view at one distance from the epipole. What is
-nearer is enlarged, and what is farther is reduced. That distance is this quantile of the distances
-of all pixels of the view. Chosen like `MAX_STRETCH`."""
+"""A polar frame has the resolution of the first view at this quantile of the distances of the
+view's pixels from the epipole. Chosen like `MAX_STRETCH`."""
 
 MIN_RADIUS_PX = 8.0
 """A polar frame leaves out pixels nearer to the epipole than this, because hardly anything moves
@@ -50,8 +47,8 @@ class PlanarFrame:
     """A frame to which each of two views is rectified by a homography.
 
     `homographies` are the (3, 3) matrices that map the pixels of each view to the frame, and `size`
-    is its (width, height). In the methods, `view` is 0 for the first view and 1 for the second.
-    Parts of a view beyond the line that its homography maps to infinity are not shown.
+    is the (width, height) of the frame. In the methods, `view` is 0 for the first view and 1 for
+    the second. Parts of a view beyond the line that its homography maps to infinity are not shown.
     """
 
     homographies: tuple[np.ndarray, np.ndarray]
@@ -81,14 +78,13 @@ class PlanarFrame:
 class PolarFrame:
     """A frame to which two views are rectified about their epipoles, in polar coordinates.
 
-    The methods are those of `PlanarFrame`. The `orientation`, 1 or -1, tells which half of an
-    epipolar line in the second view corresponds to a half of a line in the first view. Angles are
-    those about the epipole of the first view, in radians: `middle` is the direction of the centre
-    of the view (0 if the epipole lies in the view), and `first_angle` is the angle of the first row
-    minus `middle`. `min_radius_px` is the distance of the first column from the epipole. From row
-    to row, the angle grows by `step`. From column to column, the natural logarithm of the distance
-    grows by `step`. If there is a homography `plane` from the first view to the second, the second
-    view is first warped by its inverse.
+    The methods are those of `PlanarFrame`. Rows are angles about the epipole of the first view, in
+    radians, and columns are distances from it. The first row has the angle `middle` +
+    `first_angle`, and the angle grows by `step` per row. The first column has the distance
+    `min_radius_px`, and the natural logarithm of the distance grows by `step` per column. `middle`
+    is the direction of the view's centre, or 0 if the epipole lies in the view. `orientation`, 1 or
+    -1, selects a half of each epipolar line in the second view. If a homography `plane` from the
+    first view to the second is given, its inverse first warps the second view.
     """
 
     fundamental: np.ndarray
@@ -167,8 +163,8 @@ def rectified_frame(
 
     The frame is planar if that distorts the views little, otherwise polar. The result is None if
     neither is possible or there are fewer than eight matches. Sizes are (width, height). `plane`
-    may be the homography of a plane in the scene, from the first view to the second. It is used to
-    first warp the second view to the first, which removes the slant of the plane.
+    may be the homography of a plane in the scene, from the first view to the second. Its inverse
+    first warps the second view, which removes the slant of the plane.
     """
     if plane is not None:
         shown = transform_points(points1, np.linalg.inv(plane))

@@ -32,28 +32,27 @@ MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Number of matches that the minimal solver of each model needs."""
 
 MIN_PARALLAX_PX = 3.0
-"""A match is off the plane if its transfer error under the homography is at least this. The value
-was chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+"""A match is off the plane if its transfer error under the homography is at least this. Chosen on
+Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MAX_EPIPOLE_DISTANCE_PX = 1.5
-"""A match off the plane agrees with an epipole if its position in the second image is closer than
-this to the line through the epipole and the predicted position. Chosen like `MIN_PARALLAX_PX`."""
+"""A match off the plane agrees with an epipole if it is closer than this to the line from the
+epipole to the position predicted by the homography. Chosen like `MIN_PARALLAX_PX`."""
 
 MIN_FRACTION_OF_PLANE = 0.2
 """A scene has depth only if the number of matches that agree on an epipole is at least this
-fraction of the number on the plane. Repeated patterns and moved objects give fewer. Chosen like
-`MIN_PARALLAX_PX`."""
+fraction of the number on the plane. Moved objects give fewer. Chosen like `MIN_PARALLAX_PX`."""
 
 MIN_FRACTION_OF_REST = 0.5
-"""If nothing else shows that a scene has depth, at least this fraction of the matches off the plane
-must agree on an epipole. Chosen like `MIN_PARALLAX_PX`."""
+"""The matches off the plane show that a scene has depth only if at least this fraction of them
+agree on an epipole. Chosen like `MIN_PARALLAX_PX`."""
 
 MAX_MATCHES = 2000
 """`measure_parallax` uses at most this many random matches off the plane. Chosen by hand."""
 
 SAMPLES = 1000
-"""Number of candidate epipoles. Each is the intersection of the lines that two random matches give,
-from the predicted to the actual position. Chosen by hand."""
+"""Number of candidate epipoles. Each is the intersection of two random matches' lines, from the
+position predicted by the homography to the actual position. Chosen by hand."""
 
 
 @suggest_keywords
@@ -63,8 +62,7 @@ class GeometryOptions:
 
     Attributes:
         inlier_threshold: a match is an inlier if its error is below this, in pixels. The error is
-            the transfer error of a homography, or the Sampson distance of other models, which is
-            d / sqrt(2) for a match of a rectified pair that is d rows off.
+            the transfer error of a homography, or the Sampson distance of other models.
         homography: a known (3, 3) homography. It is then not estimated, and the inliers are the
             matches with a transfer error below the threshold.
         camera0, camera1: (3, 3) camera matrices, for the model "essential".
@@ -112,8 +110,8 @@ class Geometry:
     Attributes:
         model: "homography", "fundamental" or "essential".
         matrix: (3, 3) float64, or None if the estimation failed. A homography maps the first image
-            to the second. For the other models x1^T M x0 = 0, where an essential matrix takes
-            normalised coordinates (rays), not pixels.
+            to the second. For the other models, x1^T matrix x0 = 0 for a match of x0 and x1, in
+            pixels or, for an essential matrix, in normalised coordinates (rays).
         inliers: (M,) bool, True for the matches that agree with the matrix.
     """
 
@@ -342,9 +340,8 @@ class Parallax:
     If a homography does not explain a correct match of a static scene, the match is displaced from
     the predicted position along a line through the epipole (Chum, Werner and Matas, "Two-view
     geometry estimation unaffected by a dominant plane", 2005). Wrong matches are displaced in any
-    direction. Those of a repeated pattern are all displaced in one direction, but they are few
-    compared with the matches on the plane. `log10_nfa` is the log10 of the number of false alarms:
-    the lower it is, the less likely the agreement is due to chance.
+    direction, except for a few in one direction on a repeated pattern. `log10_nfa` is the log10 of
+    the number of false alarms of the agreement on the epipole.
     """
 
     on_plane: int
@@ -374,8 +371,8 @@ class TwoViewModel(Geometry):
 
     Attributes:
         log10_nfa: decimal logarithm of the number of false alarms of the geometry.
-        parallax: parallax of the matches that the homography does not explain. None if it was not
-            measured; it is measured for a trusted homography if the model is "auto".
+        parallax: parallax of the matches that the homography does not explain, or None if it was
+            not measured.
     """
 
     log10_nfa: float
@@ -390,7 +387,7 @@ class TwoViewModel(Geometry):
 def measure_parallax(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, seed: int = 0
 ) -> Parallax:
-    """Find an epipole on which those (M, 2) matches agree that are off the homography's plane."""
+    """Find the epipole on which most (M, 2) matches off the homography's plane agree."""
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX
     on_plane = len(off) - int(np.count_nonzero(off))
@@ -428,7 +425,7 @@ def measure_parallax(
 
 
 def _misses(epipoles: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the (E, N) distances of points from the lines through epipoles and predictions."""
+    """Return the (E, N) distances of `second` from the lines through epipoles and `first`."""
     x, y, scale = epipoles.T[:, :, None]
     normal = np.hypot(y - scale * first[:, 1], scale * first[:, 0] - x)
     return np.abs(epipoles @ np.cross(first, second).T) / np.maximum(normal, 1e-12)

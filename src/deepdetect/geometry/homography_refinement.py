@@ -3,10 +3,9 @@
 In two rounds, corners of the first image are tracked to the warped second image and back, and a
 homography is fitted to the tracks. In the last step, all pixels of reduced copies are aligned
 (Evangelidis and Psarakis, "Parametric image alignment using enhanced correlation coefficient
-maximization", 2008). For cross-validation, the black and the white squares of a chessboard divide
-the image into two halves. A correction of the homography is fitted to each half, and used to warp
-the other half. The step is kept only if this improves more windows than it worsens. All of this
-takes a fraction of a second.
+maximization", 2008). For cross-validation, the image is divided into the black and the white
+squares of a chessboard. The correction fitted to either colour is used to warp the other. The step
+is kept only if this improves more windows than it worsens.
 """
 
 from __future__ import annotations
@@ -34,8 +33,7 @@ from .transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
 """Each round has a side of the tracked windows in pixels, a maximum number of corners, and a number
-of pyramid levels. In the first round corners move farther, and it needs only half as many. Chosen
-by hand."""
+of pyramid levels. Corners move farther in the first round. Chosen by hand."""
 
 MIN_TRACKS = 15
 """A homography is fitted only if there are at least this many tracks. Chosen by hand."""
@@ -75,9 +73,8 @@ returns None if the fit fails."""
 def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Refine the homography from the first of two grey images to the second.
 
-    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. The
-    docstring of the module tells how each step is validated. If no step improves the homography, it
-    is returned unchanged except for its scale: the last element of the result is always 1.
+    The images are (H, W) uint8, and the homography must be accurate to about ten pixels. The last
+    element of the result is 1. If no step improves the homography, only its scale changes.
     """
     size = (gray0.shape[1], gray0.shape[0])
     blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)
@@ -94,8 +91,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
     steps.append(partial(_fit_to_pixels, gray0))
     current = np.asarray(homography, np.float64)
     for step in steps:
-        # Tracking corners needs detail, which linear interpolation loses if the scales differ. Only
-        # the last step, which aligns all pixels, uses linear interpolation.
+        # Linear interpolation loses detail that tracking needs. Only the last step does not track.
         warp = partial(warp_to_reference, exact=step is steps[-1])
         warped, valid_mask = warp(gray1, current, size)
         fit = step(warped, valid_mask)
@@ -138,9 +134,8 @@ def _fit_to_corners(
 ) -> Fit:
     """Track corners, and return a function that fits a homography to those in a part of the image.
 
-    The fit is by weighted least squares, which is accurate on most of an image even if no
-    homography fits all of it, for example because of lens distortion. RANSAC would then give
-    another result for each random sample.
+    The fit is by weighted least squares, because RANSAC gives a different result for each random
+    sample if no homography fits the whole image, for example due to lens distortion.
     """
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
@@ -196,8 +191,7 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
 def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
     """Fit a homography to (N, 2) points by iteratively reweighted least squares (Cauchy weights).
 
-    The last element of the result is 1. The result is None if the points do not determine a
-    homography.
+    Returns None if the points determine no homography. The last element of the result is 1.
     """
     middle = points0.mean(axis=0)
     spread = float(np.abs(points0 - middle).mean())
@@ -233,9 +227,9 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
 def _halves(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Divide an image of (width, height) into the squares of a chessboard.
 
-    Returns two bool masks. The first, (H, W), is True for pixels on squares of the second colour.
-    The second, (H // STEP_PX, W // STEP_PX), is True for those windows of `local_zncc` that lie
-    within one square, with a margin for the blur.
+    Returns two bool masks. The first, (H, W), is True for pixels on squares of one colour. The
+    second, (H // STEP_PX, W // STEP_PX), is True for those windows of `local_zncc` that lie within
+    one square, with a margin for the blur.
     """
     margin = WINDOW_PX // 2 + int(np.ceil(3 * BLUR_SIGMA_PX))
     side = max(max(size) / SQUARES, 4 * margin)

@@ -51,8 +51,8 @@ def warp_to_reference(
     """Warp the second image into the frame of the first; `homography` maps the first to the second.
 
     Returns the warped image of the given (width, height), and the (H, W) bool mask of the pixels
-    that show the second image. OpenCV's cubic interpolation keeps detail, but shifts it by up to
-    0.05 px. If `exact`, the interpolation is linear, which does not shift.
+    that show the second image. If `exact`, the interpolation is linear, because OpenCV's cubic
+    interpolation shifts detail by up to 0.05 px.
     """
     flags = (cv2.INTER_LINEAR if exact else cv2.INTER_CUBIC) | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image1, homography, size, flags=flags)
@@ -70,7 +70,7 @@ def warp_bands(
     """Warp an image of C bands, (H, W, C) of any type of number, as `warp_to_reference` does.
 
     A pixel has no data if any of its bands has the value `no_data`. Pixels of the result that
-    depend on such a pixel, or lie outside the image, become `no_data`, or 0 if it is None.
+    depend on such a pixel, or lie outside the image, become `no_data`, or 0 if that is None.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:
@@ -99,9 +99,9 @@ def local_zncc(
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation (ZNCC) of windows at the same positions.
 
-    The images are divided into squares of `step_px` pixels, and one window is centred on each. Its
-    side `window_px` must be an odd multiple of `step_px`. Returns an array (H // step_px,
-    W // step_px) float32 in [-1, 1], NaN for windows that are flat or partly outside `valid_mask`.
+    A window of side `window_px`, an odd multiple of `step_px`, is centred on each square of
+    `step_px` pixels. Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for windows that
+    are flat or partly outside `valid_mask`.
     """
     side = window_px // step_px
     shape = (first.shape[0] // step_px, first.shape[1] // step_px)
@@ -157,11 +157,7 @@ def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
 
 
 def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
-    """Subtract the mean of the window around each pixel and divide by its standard deviation.
-
-    Returns (H, W) float32. The ZNCC of two images in a window is approximately the mean of the
-    product of their normalised images over this window.
-    """
+    """Subtract each window's mean and divide by its standard deviation; return (H, W) float32."""
     window = (WINDOW_PX, WINDOW_PX)
     values = gray.astype(np.float32)
     mean = cv2.boxFilter(values, cv2.CV_32F, window)
@@ -236,8 +232,8 @@ def track_round_trip(
     a point can move. A track has converged when an iteration moves it by less than `step_px`.
 
     The search in the second image begins at the (N, 2) positions `expected`, by default at
-    `points`. The search back begins at the position just found, or at `points` if `back_to_start`.
-    If `expected` is given, it begins at the position just found minus the expected motion.
+    `points`. The search back begins at the position just found, minus the expected motion if
+    `expected` is given. Without `expected`, it begins at `points` if `back_to_start`.
 
     Returns (N, 2) float32 positions in the second image, and (N,) distances in pixels between the
     start and the end of each round trip, infinite for lost tracks.
@@ -300,8 +296,7 @@ scaled so that their quantile EDGE_QUANTILE becomes white (255). Both were chose
 def edge_strength(gray: np.ndarray) -> np.ndarray:
     """Return the length of the gradient of an (H, W) uint8 luma image, scaled to uint8.
 
-    It does not depend on which side of an edge is brighter, so images of different sensors, whose
-    tones may be inverted, look alike.
+    The result is the same for inverted tones, so that images of different sensors look alike.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
     length = np.hypot(cv2.Scharr(smooth, -1, 1, 0), cv2.Scharr(smooth, -1, 0, 1))

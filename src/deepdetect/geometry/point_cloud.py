@@ -15,8 +15,7 @@ UNITS = {
     "baseline": "baselines (1 = the distance between the two cameras)",
     "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
 }
-"""Units of length, each with the words that describe it in files. Lengths in one of the last two
-have no metric scale."""
+"""Units of length, and their description in files. The last two have no metric scale."""
 
 EAST_NORTH_UP = "x east, y north, z up"
 """`PointCloud.frame` of a georeferenced cloud. Any other value is the name of a camera."""
@@ -25,8 +24,7 @@ BOX_PERCENTILE = 1.0
 """This percentage of the points lies beyond each face of the robust box. Chosen by hand."""
 
 MAX_ANGULAR_SPACING = 0.02
-"""`angular_spacing` returns at most this angle, in radians, which limits the width at which points
-are drawn. Chosen by hand."""
+"""Maximum of `angular_spacing` in radians; it limits the size of drawn points. Chosen by hand."""
 
 
 @suggest_keywords

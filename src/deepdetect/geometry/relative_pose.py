@@ -16,8 +16,7 @@ Pose = tuple[np.ndarray, np.ndarray]
 X1 = rotation @ X0 + translation in the frame of the second."""
 
 BLOCK = 100_000
-"""`triangulate` processes at most this number of matches at once, because it needs the memory of
-some twenty arrays of that length."""
+"""`triangulate` processes at most this number of matches at once, because it needs much memory."""
 
 MAX_ITERATIONS = 10
 """Gauss-Newton stops after this many steps. Chosen by hand."""
@@ -29,16 +28,13 @@ MIN_CHANGE = 1e-9
 """The refinement ends when no parameter of the pose changes by more than this, in radians."""
 
 MAX_REFITS = 4
-"""The pose that RANSAC finds is fitted to its inliers, which are then determined again. This is
-done at most this many times. Chosen by hand."""
+"""The pose is refitted to its inliers at most this many times. Chosen by hand."""
 
 MIN_INLIER_GAIN = 0.01
-"""The pose is fitted again only if the previous fit raised the number of inliers by more than this
-fraction. Chosen by hand."""
+"""Refitting ends if the number of inliers grows by at most this fraction. Chosen by hand."""
 
 MAX_MATCHES = 50_000
-"""If there are more matches than this, the pose is fitted to every k-th of them, because more do
-not improve it."""
+"""The pose is fitted to at most this number of matches, because more do not improve it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +64,8 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate (N, 2) matches in pixels; the pose is X1 = rotation @ X0 + translation.
 
-    The positions of each match are first moved onto corresponding epipolar lines by
-    `correct_matches`, which is the maximum likelihood estimate if the noise in both images is
-    equal. The two rays then meet, and the depth follows from one division, which is accurate even
-    if the angle between the rays is small.
+    Each match is first moved onto corresponding epipolar lines by `correct_matches`, so that its
+    two rays meet. This is the maximum likelihood estimate if the noise in both images is equal.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -123,8 +117,7 @@ def correct_matches(
         step = step * 2 * root / ((next0**2).sum(1) + (next1**2).sum(1))
         moved0 = points0 - step[:, None] * next0
         moved1 = points1 - step[:, None] * next1
-    # The correction of a match at an epipole is not finite. This match needs none, because every
-    # line through an epipole is an epipolar line.
+    # A match at an epipole has no finite correction and needs none: all lines there are epipolar.
     known = np.isfinite(moved0).all(1) & np.isfinite(moved1).all(1)
     return np.where(known[:, None], moved0, points0), np.where(known[:, None], moved1, points1)
 
@@ -157,7 +150,7 @@ class RelativePose:
 
 
 def rotation_angle(rotation: np.ndarray) -> float:
-    """Return the angle of a rotation in degrees; small angles are accurate as well."""
+    """Return the angle of a rotation in degrees; small angles are also accurate."""
     skew = (rotation - rotation.T)[[2, 0, 1], [1, 2, 0]]
     return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(rotation) - 1)))
 
@@ -272,10 +265,9 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def best_of_four(
     essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the one of the four poses of an essential matrix that the matches support most.
+    """Return the pose of an essential matrix with the most points in front of both cameras.
 
-    For this pose, most triangulated points lie in front of both cameras. The essential matrix is in
-    normalised coordinates, and the (M, 2) matches are in pixels.
+    The essential matrix is in normalised coordinates, and the (M, 2) matches are in pixels.
     """
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
     points0, points1 = _evenly(points0), _evenly(points1)

@@ -2,11 +2,10 @@
 
 Three assumptions hold for most pairs of images: pixels are square, the principal point lies near
 the middle of the image, and both images were taken with about the same focal length. RANSAC is run
-for each of a few focal lengths. If a focal length is given, a sample for a relative pose needs only
-five matches, while a sample for a fundamental matrix needs seven. Therefore more samples contain no
-wrong match, and the model has fewer degrees of freedom that could fit wrong matches. The focal
-length whose inliers are the best evidence is kept. Then the pose and the parameters of both cameras
-are fitted to these inliers together.
+for each of a few focal lengths. With a given focal length, a sample needs only five matches, while
+a sample for a fundamental matrix needs seven. Therefore more samples contain no wrong match. The
+focal length whose inliers are the best evidence is kept. Then the pose and the parameters of both
+cameras are fitted to these inliers together.
 """
 
 from __future__ import annotations
@@ -52,15 +51,13 @@ FOCAL_DIFFERENCE = 0.03
 image, has the mean 0 and this standard deviation. Chosen by hand."""
 
 PRINCIPAL_POINT_SPREAD = 0.03
-"""The prior is that the principal point deviates from the image centre, in x and in y, with this
-standard deviation, in units of the longer side of the image. Chosen by hand."""
+"""Prior standard deviation of cx and cy, in units of the longer image side. Chosen by hand."""
 
 MATCH_SIGMA_PX = 0.5
 """Standard deviation of correct matches from their epipolar lines. Chosen by hand."""
 
 MAX_FITS = 4
-"""Pose and cameras are fitted at most this many times, each time to the inliers of the previous
-fit. Chosen by hand."""
+"""Pose and cameras are fitted to the inliers at most this many times. Chosen by hand."""
 
 MAX_ITERATIONS = 20
 """Levenberg-Marquardt stops after this many steps. Chosen by hand."""
@@ -75,9 +72,8 @@ def estimate_semi_calibrated(
 ) -> TwoViewModel | None:
     """Estimate a fundamental matrix from (M, 2) matches, many of which may be wrong.
 
-    See the module for the method and its assumptions. `sizes` are the (width, height) of the two
-    images, and the threshold is a Sampson distance in pixels. Returns None if there are too few
-    matches or the estimation fails.
+    `sizes` are the (width, height) of the two images, and the threshold is a Sampson distance in
+    pixels. Returns None if there are too few matches or the estimation fails.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -130,10 +126,9 @@ def refine_fundamental(
 ) -> np.ndarray:
     """Refine a fundamental matrix by matches, most of them correct, and a prior on the cameras.
 
-    The prior decides what the matches hardly determine, such as the focal length, or the epipolar
-    lines near the image borders. `match_sigmas_px` are the (M,) expected standard deviations of the
-    distances of matches from their epipolar lines. The result has norm 1. With fewer than six
-    matches the given matrix is returned unchanged.
+    The prior decides what the matches hardly determine, such as the focal length. `match_sigmas_px`
+    are the (M,) expected standard deviations of the matches' distances from their epipolar lines.
+    The result has norm 1. If there are fewer than six matches, the given matrix is returned.
     """
     if len(points0) < MIN_MATCHES:
         return fundamental

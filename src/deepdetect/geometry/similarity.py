@@ -1,7 +1,7 @@
 """Fit a similarity robustly to points that are known in two frames, to georeference a model.
 
 A least-median-of-squares search finds a similarity on which most points agree. Gauss-Newton with
-Huber's weights then refines it, using all points and directions that are known to be horizontal.
+Huber's weights then refines it, using all points, and directions that are known to be horizontal.
 """
 
 from __future__ import annotations
@@ -26,14 +26,12 @@ MAX_START_TILT_DEG = 60.0
 at most this angle, because three points that lie nearly on a line can give any tilt."""
 
 MIN_AREA_POINTS, MIN_AREA = 8, 0.2
-"""The points can overrule the known upward direction only if they determine a rotation well: there
-must be at least MIN_AREA_POINTS points, and their spread along the second principal axis, divided
-by that along the first, must be above MIN_AREA. Chosen by hand."""
+"""The points can overrule the known upward direction only if there are at least MIN_AREA_POINTS,
+and their second principal axis is above MIN_AREA times as long as the first. Chosen by hand."""
 
 MUCH_BETTER = 0.5
-"""The known upward direction is overruled if the best similarity that tilts it by more than
-`MAX_START_TILT_DEG` has a median distance between targets and transformed points below this
-fraction of that of the best similarity that tilts it less. Chosen by hand."""
+"""The known upward direction is overruled only if tilting it by more than `MAX_START_TILT_DEG`
+reduces the median distance from the targets to below this fraction. Chosen by hand."""
 
 HUBER_STDS = 2.0
 """Residuals larger than this number of standard deviations get less weight. Chosen by hand."""
@@ -46,8 +44,7 @@ PRIOR_COUNT = 6.0
 residuals say little about the true accuracy. Chosen by hand."""
 
 MAD_STD = 1.4826
-"""Ratio of the standard deviation of normally distributed values to the median of their absolute
-values."""
+"""Ratio of the standard deviation of a normal distribution to its median absolute deviation."""
 
 MAX_ITERATIONS, MIN_STEP = 50, 1e-9
 
@@ -77,8 +74,7 @@ class SimilarityFit:
         axes_std_deg: (3,) standard deviations, in degrees, of the rotation about the x, y and z
             axes of the targets.
         axis_std_deg_of_targets: standard deviation, in degrees, of the rotation about its least
-            certain axis if only the points and targets are used, without horizontal directions; 180
-            if they do not determine this rotation.
+            certain axis, as determined without the horizontal directions; at most 180.
     """
 
     similarity: Similarity
@@ -122,7 +118,7 @@ def fit_similarity(
     found = _search(points, targets, known, up, scale, seed)
     if found is None:
         raise ReconstructionError("the points are in one place")
-    middle = points.mean(axis=0)  # rotation and scale about it do not change the translation
+    middle = points.mean(axis=0)  # rotation and scale about this point keep the translation
     own, free = points - middle, 7 if scale is None else 6
     current = Similarity(found.scale, found.rotation, found.apply(middle[None])[0])
     distances = np.linalg.norm((targets - current.apply(own)) * known, axis=1)
@@ -144,8 +140,7 @@ def fit_similarity(
         weighted = jacobian * weights[:, None, None]
         of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
         right = np.einsum("nai,na->i", weighted, residuals / stds)
-        # A level direction v is horizontal if e_z . exp(w) R v = 0. Deviating directions get less
-        # weight, as points do, because some photographs are tilted.
+        # Level directions should have z = 0. Others get less weight, as some images are tilted.
         seen = level @ current.rotation.T
         errors = seen[:, 2] / level_stds
         rows = np.zeros((len(level), 7))
@@ -210,7 +205,7 @@ def least_squares_similarity(
     up: np.ndarray | None = None,
     scale: float | None = None,
 ) -> Similarity | None:
-    """Fit a similarity by least squares (Umeyama, 1991). None if all points coincide.
+    """Fit a similarity by least squares (Umeyama, 1991); return None if all points coincide.
 
     If `up` is given, this direction is mapped to the z axis, and only the rotation about the z axis
     is fitted.

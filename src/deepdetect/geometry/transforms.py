@@ -73,11 +73,7 @@ def signed_epipolar_errors(
 
 
 def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Multiply (N, 2) points, as columns (x, y, 1), by a matrix of three columns.
-
-    Returns a list with one (N,) array for each row of the matrix. Each is computed by itself,
-    because a matrix product takes several times as long.
-    """
+    """Multiply points (x, y, 1) by each row of a matrix; this is faster than a matrix product."""
     x, y = points[:, 0], points[:, 1]
     coordinates = []
     for row in matrix:
@@ -89,8 +85,7 @@ def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
 
 
 TOLERANCE_PX = 1.0
-"""A match is correct if its distance from the ground truth is at most this, as in Middlebury's
-evaluation."""
+"""A match is correct within this distance of the ground truth, as in Middlebury's evaluation."""
 
 
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:

@@ -2,8 +2,7 @@
 
 Matching, reconstruction and stitching all use this decision. A homography and a fundamental matrix
 are fitted to the same matches. The decision depends on their inliers, and on the parallax of the
-matches that the homography does not explain. The thresholds were chosen on Oxford, Middlebury,
-Strecha's fountain and a KITTI clip.
+matches that the homography does not explain.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from .semi_calibrated import START_FOCAL_LENGTHS, estimate_semi_calibrated
 from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
-"""Inlier thresholds in pixels of the models that guide matching. They are fitted to keypoints of
-reduced copies of the images, which are less accurate."""
+"""Inlier thresholds in pixels of the models that guide matching. These models are fitted to less
+accurate keypoints, from reduced copies of the images."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
 """Inlier thresholds in pixels of the models by which a scene is classified. Chosen on Oxford,
@@ -56,8 +55,7 @@ clearly off the plane. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MIN_FOREGROUND_ON_LINES = 0.8
 """There is a foreground only if at least this fraction of the matches clearly off the plane are
-inliers of the fundamental matrix. On sixteen planar pairs of Oxford, which have no foreground, the
-fraction is at most 0.65."""
+inliers of the fundamental matrix. On 16 planar pairs of Oxford, the fraction is at most 0.65."""
 
 
 def fit_model(
@@ -87,11 +85,11 @@ def choose_model(
 ) -> TwoViewModel:
     """Return the model that may guide matching; many of the matches may be wrong.
 
-    `model` is "homography", "fundamental" or "auto". "auto" takes a trusted homography, unless
-    the matches that it does not explain show depth. Otherwise it takes the fundamental matrix if
-    that is trusted or has fewer false alarms. With `semi_calibrated`, the fundamental matrix may
-    come from `estimate_semi_calibrated`, which needs fewer correct matches but more time. The
-    caller must check whether the result is `trusted`.
+    `model` is "homography", "fundamental" or "auto". For "auto", a trusted homography is returned
+    unless the other matches show depth. Otherwise the fundamental matrix is returned if it is
+    trusted or has fewer false alarms than the homography. With `semi_calibrated`, the fundamental
+    matrix may come from `estimate_semi_calibrated`, which needs fewer correct matches but more
+    time. The caller must check whether the result is `trusted`.
     """
     plane = TwoViewModel("none", None, np.zeros(len(points0), bool), float("inf"))
     if model != "fundamental":
@@ -122,9 +120,9 @@ def classify_scene(
 ) -> tuple[str, TwoViewModel]:
     """Classify a pair by (M, 2) matches that are spread out, and return its fundamental matrix.
 
-    The class is one of "unrelated" (no model explains enough matches), "static" (nothing moves),
-    "rotation" (the camera only rotated), "plane" (without a calibration also a rotation), and
-    "depth". The matches must be spread out, because adjacent ones are not independent evidence.
+    The class is "unrelated" (no model explains enough matches), "static" (nothing moves),
+    "rotation" (the camera only rotated), "plane" (without a calibration also a rotation), or
+    "depth". Adjacent matches would not be independent evidence.
     """
     plane, epipolar = (
         fit_model(points0, points1, model, size1, SCENE_THRESHOLDS_PX[model], seed)

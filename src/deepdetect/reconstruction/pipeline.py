@@ -46,10 +46,9 @@ SOR_WINDOW_PX = 9
 window with this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
-"""These are the minimum fractions of keypoints with a match on their row. MIN_UNIQUE_FRACTION
-applies if matches must be unique: the fraction was up to 0.005 for unrelated images, and at least
-0.35 for rectified pairs. MIN_MATCHED_FRACTION applies if they need not be unique: the fraction was
-up to 0.16 for unrelated images, and at least 0.64 for rectified pairs."""
+"""Minimum fractions of keypoints with a match on their row. MIN_UNIQUE_FRACTION is used if matches
+must be unique: unrelated images had up to 0.005, and rectified pairs at least 0.35. Otherwise
+MIN_MATCHED_FRACTION is used: unrelated images had up to 0.16, rectified pairs at least 0.64."""
 
 
 @suggest_keywords
@@ -290,9 +289,9 @@ def sor_inliers_on_grid(
 ) -> np.ndarray:
     """Return (N,) bool, True for (N, 2) pixels of the left image that are not statistical outliers.
 
-    This is like `sor_inliers`, but the neighbours of a pixel are all others in a window. Its
-    distance from them is the root mean square of the differences in disparity, which three box
-    filters compute. A pixel without neighbours is an outlier only if most pixels have some.
+    Unlike in `sor_inliers`, the neighbours of a pixel are all others in a window. Its distance from
+    them is the root mean square difference in disparity. A pixel without neighbours is an outlier
+    only if most pixels have neighbours.
     """
     if not len(pixels):
         return np.ones(0, bool)
@@ -333,7 +332,6 @@ def _calibration(
     images: tuple[Any, Any],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> Calibration:
-    """Return the given calibration, or make one from `focal_px` or the EXIF data of the images."""
     if given is not None and focal_px is not None:
         raise OptionError("give `calibration` or `focal_px`, not both")
     if isinstance(given, Calibration):

@@ -1,8 +1,7 @@
 """Recognise rectified pairs, and check that the calibration fits and that they show depth.
 
-The matches of a rectified pair lie on the same row in both images. This rule has no parameters. A
-pair is rectified if the rule explains about as many matches as the best models with parameters,
-which are a fundamental matrix and rows that are shifted, tilted and scaled.
+The matches of a rectified pair lie on the same row in both images. A pair is rectified if about as
+many matches do so as fit a fundamental matrix, or rows that are shifted, tilted and scaled.
 """
 
 from __future__ import annotations
@@ -23,17 +22,16 @@ MAX_ROW_DISTANCE_PX = 1.0
 """A match of a rectified pair may lie at most this far from its row. Chosen by hand."""
 
 MIN_INLIER_RATIO = 0.9
-"""A pair is rectified only if the number of matches on the same row is at least this fraction of
-the number that the best model with parameters explains. Chosen by hand."""
+"""A pair is rectified only if its matches on the same row number at least this fraction of the
+inliers of the best fitted model. Chosen by hand."""
 
 MIN_DISPARITY_SPREAD_PX = 2.0
 """A pair is rectified only if its disparities spread by at least this from the 5th to the 95th
 percentile. Matches at whole pixels always spread by 1, because their positions are rounded."""
 
 MIN_PLANAR_SPREAD_PX = 8.0
-"""If one homography explains all matches of a pair, the pair is rectified only if its disparities
-spread by at least this. Those of a slanted plane do; those of a camera that only rotated a little
-spread less than this."""
+"""If one homography explains all matches, a pair is rectified only if its disparities spread by at
+least this, as on a slanted plane. After a small rotation of the camera, they spread less."""
 
 GRID_SIZE_PX = 8
 """The left image is divided into cells of this side. Each gives one match. Chosen by hand."""
@@ -46,13 +44,11 @@ COARSE_SIDE_PX, COARSE_KEYPOINTS = 480, 1000
 COARSE_SIDE_PX, with at most COARSE_KEYPOINTS keypoints in each. Chosen by hand."""
 
 MIN_COARSE_INLIERS = 50
-"""The coarse pass decides only if a fundamental matrix explains at least this number of its
-matches. Chosen by hand."""
+"""The coarse pass decides only if this many matches fit a fundamental matrix. Chosen by hand."""
 
 MAX_COARSE_ROW_ERROR_PX = 0.6
-"""The coarse pass accepts a pair as rectified only if its `_row_error` is below this, in pixels of
-the full images. The limit can be below 1, because that error is computed from all matches together,
-which are more accurate than each match alone."""
+"""The coarse pass accepts a pair as rectified only if its `_row_error`, in pixels of the full
+images, is below this. Many matches determine this error, so the limit can be below 1."""
 
 MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
 """The focal lengths of rectified views may differ by at most this fraction, so that values rounded
@@ -71,8 +67,7 @@ MIN_DISPARITY_PX = -1.0
 below this. One pixel is allowed for noise."""
 
 MAX_BEHIND_FRACTION = 0.25
-"""A calibration is wrong if more than this fraction of the points lies behind the cameras. Chosen
-by hand."""
+"""Maximum fraction of points behind the cameras for a correct calibration. Chosen by hand."""
 
 MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
 """A rotation explains a disparity if its error is below MAX_ROTATION_ERROR_PX. A pair is rejected
@@ -85,15 +80,15 @@ rotation, divided by that under the best plane, is below this. The ratio was up 
 views, and at least 5.3 for slanted walls."""
 
 MAX_OFF_ROW_PX = 1.0
-"""Disparities come from matches on the same row, so a rotation cannot explain them if the median
-distance by which it moves points off their rows is above this."""
+"""A rotation cannot explain disparities, which come from matches on the same row, if it moves
+points off their rows by a median distance above this."""
 
 ROBUST_ITERATIONS = 12
 
 ROTATION_GRID_SIZE_PX, MIN_ROTATION_MATCHES, MAX_ROTATION_SAMPLES = 16, 30, 50_000
-"""A rotation is fitted to one disparity from each cell with the side ROTATION_GRID_SIZE_PX, if this
-gives at least MIN_ROTATION_MATCHES disparities. Before that, if there are more disparities than
-MAX_ROTATION_SAMPLES, a random sample of that number is taken. Chosen by hand."""
+"""A rotation is fitted to one disparity per cell with the side ROTATION_GRID_SIZE_PX, if there are
+at least MIN_ROTATION_MATCHES. At most MAX_ROTATION_SAMPLES random disparities are considered.
+Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -105,9 +100,8 @@ class Rectification:
         reason: why the pair is not rectified; empty if it is.
         swapped: whether the pair is rectified, but left and right are exchanged.
         on_rows: number of `matches` whose rows in the two images differ by at most one pixel.
-        by_fundamental: number of matches that a fundamental matrix explains as accurately.
-        by_other_rows: number of matches that rows explain if they may be shifted, tilted and scaled
-            between the images.
+        by_fundamental: number of matches that a fundamental matrix explains with that tolerance.
+        by_other_rows: number of matches that fit rows that are shifted, tilted and scaled.
         matches: number of matches that were used, one per cell of the left image.
         vertical_offset: median of y in the second image minus y in the first, in pixels, of the
             matches that the fundamental matrix explains; NaN if there are none.
@@ -181,9 +175,9 @@ def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
     """Return the `MIN_INLIER_RATIO` quantile of the row errors of a pair that looks rectified.
 
     The row error is how many pixels the rows of the two images are off at a position. A single
-    match is too inaccurate to tell it. Therefore a smooth function is fitted to the distances of
-    all matches from their rows, and its values are used. It depends on the position (for rotated
-    views and lens distortion) and on the disparity (for a camera that also moved up or down).
+    match is too inaccurate, so a smooth function is fitted to y1 - y0 of all matches. It depends on
+    the position, for rotated views and lens distortion, and on the disparity, for a camera that
+    also moved up or down.
     """
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
@@ -222,8 +216,7 @@ def detect_rectification(
     )
     best = max(by_fundamental, by_other_rows)
     reason = ""
-    # This NFA counts the samples from which a fundamental matrix is chosen. The rule of rows is
-    # not chosen from samples, so for it the test is stricter than necessary.
+    # Rows are not fitted to samples, so the NFA of a fundamental matrix is a stricter test.
     if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     elif on_rows_count < MIN_INLIER_RATIO * best:
@@ -258,8 +251,8 @@ def _best_other_rows(
 ) -> np.ndarray:
     """Fit y1 - y0 as a linear function of x0 and y0 by RANSAC; return its (M,) bool inliers.
 
-    These are rows that are shifted, tilted and scaled. A sample has only three matches, while one
-    for a fundamental matrix has seven, so more outliers are tolerated.
+    The rows are shifted, tilted and scaled. A sample has three matches instead of the seven of a
+    fundamental matrix, so more outliers are tolerated.
     """
     shift = points1[:, 1] - points0[:, 1]
     best = np.zeros(len(points0), bool)
@@ -314,10 +307,10 @@ def check_pure_rotation(
 ) -> None:
     """Raise a NoDepthError if a rotation explains the disparities far better than a plane does.
 
-    To first order, a rotation by an angle a about the vertical moves pixels along their rows by
-    f a (1 + x^2), where f is the focal length and x the horizontal slope of the ray. So the
-    disparities are like those of a wall, but curved. The rotation is not noticed if f is far off,
-    if the camera was also tilted, or if the curvature is smaller than the noise.
+    To first order, a rotation about the vertical by an angle a moves pixels by f a (1 + x^2) along
+    their rows, where f is the focal length and x the horizontal slope of the ray. Disparities of a
+    plane lack this curvature. The rotation is not noticed if f is far off, if the camera was also
+    tilted, or if the noise hides the curvature.
     """
     chosen = np.arange(len(pixels))
     if len(chosen) > MAX_ROTATION_SAMPLES:

@@ -38,10 +38,9 @@ class Reconstruction:
         pixels: (N, 2) float32 positions of the points in the left image.
         disparity: (N,) float32 in pixels for rectified pairs, else None. The match of (x, y) in
             the left image is (x - disparity, y) in the right image.
-        matched: (N,) bool, True for points that were matched in both images. The others got the
-            depth of a surface next to them, because the right image does not show them or they
-            are at the edge of an occluding surface. Such points exist only if every pixel of a
-            rectified pair becomes a point.
+        matched: (N,) bool, True for points that were matched in both images. The others are hidden
+            in the right image or at the edge of an occluding surface. They got the depth of an
+            adjacent surface, and exist only if every pixel of a rectified pair becomes a point.
         unit: "mm" if the baseline is known. Otherwise "baseline": the distance between the cameras
             is 1, and the true scale is not known.
         size: (width, height) of the left image.
@@ -49,9 +48,8 @@ class Reconstruction:
         rectification: the numbers on which that decision is based; None if the caller decided.
         calibration: intrinsics and baseline of the cameras.
         pose: pose of the right camera if the pair is not rectified, else None.
-        reprojection_errors: (N,) float32 distances, in pixels, of the projected points from their
-            matched positions (root mean square of both images) if the pair is not rectified,
-            else None.
+        reprojection_errors: (N,) float32 root mean square distances, in pixels, of the projected
+            points from the matched positions in both images; None for rectified pairs.
         keypoints: number of keypoints in the left image.
         matches: number of matches that were triangulated.
         dropped: number of matches that each check removed, in the order of the checks.

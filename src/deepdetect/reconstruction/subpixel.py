@@ -1,10 +1,9 @@
 """Refine matches to sub-pixel accuracy: align the patch around each point to the second image.
 
 The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004), and
-independent of the gain and offset of the brightness. Each patch is aligned twice. First it is
-warped by a similarity that is fitted to all matches, then by an affinity that is fitted to the
-refined matches around it. On Middlebury's Motorcycle, 65 % of the converged matches were within
-0.25 px of the ground truth. With a parabola through the correlation instead, 49 % were.
+independent of the gain and offset of the brightness. Each patch is aligned twice, first warped by a
+similarity fitted to all matches, then by an affinity fitted to the refined matches around it. On
+Middlebury's Motorcycle, 65 % of the converged matches were accurate to 0.25 px.
 """
 
 from __future__ import annotations
@@ -37,14 +36,13 @@ AFFINITY_WINDOW_PX = 15
 
 AFFINITY_REGULARIZATION = 20.0
 """When an affinity is fitted to the matches in a window, the similarity of all matches counts as
-much as this number of matches spread over the window. An affinity that is fitted to few matches, or
-to matches on one line, is therefore close to the similarity. Chosen by hand."""
+much as this number of matches, in case the matches are few or on one line. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES = 5000
 """The similarity is estimated from at most this number of matches, to save time."""
 
 CORNER_WINDOW_PX = 7
-"""The strength of a corner is measured in a window with this side, about that of a patch."""
+"""Strengths of corners are measured in a window with this side, about the side of a patch."""
 
 
 def refine_matches(
@@ -53,10 +51,9 @@ def refine_matches(
     """Refine the (N, 2) positions of matches in the second image to sub-pixel accuracy.
 
     The positions in the second image must be accurate to a pixel or two. Those in the first image
-    are rounded to whole pixels. Returns the refined (N, 2) float64 positions, and (N,) bool, True
+    are rounded to whole pixels. Returns the refined positions, (N, 2) float64, and (N,) bool, True
     for matches that converged. A match does not converge if its patch is flat, crosses the border,
-    moves too far or stays too different. An alignment that does not converge leaves the position
-    unchanged.
+    moves too far or stays too different. Alignments that do not converge change no positions.
     """
     pixels0 = np.rint(points0).astype(np.int64)
     start = np.array(points1, np.float64, order="C")
@@ -75,7 +72,7 @@ def refine_matches(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Return one index into (N, 2) pixels for each of `count` cells: its best Shi-Tomasi corner."""
+    """Return the indices of (N, 2) pixels: the best Shi-Tomasi corner in each of `count` cells."""
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
     side = np.sqrt(gray.size / count)
@@ -150,8 +147,8 @@ def align_patches(
     """Align patches of the first image, each warped by its affinity, to the second image.
 
     The images are (H, W) float32. `pixels0` are the centres of the patches, (N, 2) int64, `start`
-    their initial positions in the second image, (N, 2) float64, and `affinities` is (N, 2, 2). The
-    patches are divided among threads. Returns the same as `refine_matches`.
+    their initial positions in the second image, (N, 2) float64, and `affinities` is (N, 2, 2).
+    Returns the same as `refine_matches`.
     """
     from .subpixel_kernel import align
 

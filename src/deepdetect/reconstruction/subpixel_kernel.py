@@ -49,9 +49,8 @@ def align(  # type: ignore[no-untyped-def]
 ):
     """Refine the matches `first` to `last - 1`; write `refined` and `converged`.
 
-    The method is inverse compositional: the patch of the first image is the template, so its
-    derivatives and the normal matrix are computed only once for each match. The gain and offset of
-    the brightness are estimated together with the shift. The arguments are those of
+    The method is inverse compositional: the derivatives of the patch of the first image and the
+    normal matrix are computed only once for each match. The arguments are those of
     `subpixel.align_patches`, with `window` for the (side, side) weights of a patch and `least` for
     the minimum correlation of a match that has converged.
     """
@@ -137,8 +136,7 @@ def align(  # type: ignore[no-untyped-def]
             correlation = ts / np.sqrt(max(ss * tt, np.float32(1e-12)))
             if gain <= 0:
                 break
-            # The slopes are orthogonal to the template, so `ex` and `ey` depend on the shift alone,
-            # times the gain.
+            # Slopes and template are orthogonal, so `ex` and `ey` depend only on gain times shift.
             step_x = (yy * ex - xy * ey) / determinant / gain
             step_y = (xx * ey - xy * ex) / determinant / gain
             x1 -= a * step_x + b * step_y

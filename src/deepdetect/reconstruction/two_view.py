@@ -28,25 +28,21 @@ MAX_EPIPOLAR_DISTANCE_PX = 1.0
 """A match agrees with the pose if its Sampson distance is below this. Chosen by hand."""
 
 MAX_REPROJECTION_ERROR_PX = 0.5
-"""A point is kept only if its reprojection error, the root mean square of both images, is below
-this. Chosen by hand."""
+"""Maximum root mean square reprojection error of a point in both images. Chosen by hand."""
 
 POSE_CELLS = 10_000
-"""The image is divided into about this number of cells, and the pose is estimated from the match at
-the best corner of each cell. Chosen by hand."""
+"""The pose is estimated from the best corner in each of about this many cells. Chosen by hand."""
 
 GRID_SIZE_PX = 16
 """The first image is divided into cells with this side. The checks use one match from each cell,
 because neighbouring matches are not independent evidence. Chosen by hand."""
 
 MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
-"""When a pose is compared with a fundamental matrix, it explains a match if the Sampson distance
-is below this, which is also the inlier threshold of the fundamental matrix."""
+"""A pose explains a match if the Sampson distance is below this, as for a fundamental matrix."""
 
 MIN_POSE_RATIO = 0.75
-"""A pose is accepted only if the number of matches that it explains is at least this fraction of
-the number that the fundamental matrix explains. With a correct calibration, the two numbers would
-be about equal. Chosen by hand."""
+"""A pose is accepted only if it explains at least this fraction of the number of matches that the
+fundamental matrix explains. A correct calibration gives about 1. Chosen by hand."""
 
 MIN_IN_FRONT_FRACTION = 0.75
 """A pose must have this fraction of its inliers in front of both cameras. Chosen by hand."""
@@ -55,8 +51,8 @@ FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
 """These multiples of the given focal length are also tried, to check it."""
 
 MAX_FOCAL_ERROR_RATIO = 0.5
-"""The given focal length is rejected if another one reduces the median error to less than this
-fraction of it. A focal length that is wrong by a fifth is still accepted."""
+"""The given focal length is rejected if another one has less than this fraction of its median
+error. A focal length that is wrong by a fifth is still accepted."""
 
 GOOD_ERROR_PX = 0.1
 """No other focal length is tried if the given one has a median error below this. Chosen by hand."""
@@ -227,8 +223,8 @@ def check_focal(
     """Raise a ReconstructionError if a very different focal length fits the matches far better.
 
     The (M, 2) matches are those that the fundamental matrix explains, and `errors` are their (M,)
-    Sampson distances under the pose. If the camera only moved sideways, every focal length fits. A
-    wrong one, which stretches the scene in depth, is then not noticed.
+    Sampson distances under the pose. If the camera only moved sideways, every focal length fits,
+    and a wrong one is not noticed.
     """
     given = float(np.median(errors))
     if given < GOOD_ERROR_PX:
