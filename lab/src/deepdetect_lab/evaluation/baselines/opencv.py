@@ -60,8 +60,7 @@ def _make(name: str) -> cv2.Feature2D:
 def describe_with(descriptor: cv2.Feature2D, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
     """Compute an (N, D) array of OpenCV descriptors, one row per keypoint.
 
-    OpenCV leaves out some keypoints, for example ORB those near the border. Their rows are all 0,
-    which matches only by chance, so that the number of keypoints stays the same.
+    OpenCV drops some keypoints, for example near the border. Their descriptors are all 0.
     """
     dtype = np.uint8 if descriptor.descriptorType() == cv2.CV_8U else np.float32
     rows = np.zeros((len(features), descriptor.descriptorSize()), dtype)
@@ -105,11 +104,7 @@ def self_described(name: str) -> LocalFeature:
 def _harris(
     name: str, title: str, block_size: int, aperture: int, k: float, quality: float
 ) -> LocalFeature:
-    """Make a Harris detector (Harris and Stephens, 1988) that works as in the paper.
-
-    The response is dilated with a 3x3 window. Every pixel where it exceeds `quality` times the
-    largest response is a keypoint, so a corner gives several keypoints.
-    """
+    """Make the paper's Harris detector (Harris and Stephens, 1988): several points per corner."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
         response = cv2.dilate(cv2.cornerHarris(luma(rgb), block_size, aperture, k), None)
