@@ -31,7 +31,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "foreground": ("paper", "foreground"),
     "low-visibility": ("planar", "low_visibility"),
 }
-"""Module in `protocols` and function of each benchmark. The module is imported when it runs."""
+"""Module in `protocols` and function of each benchmark. Modules are imported when needed."""
 
 
 def run_benchmarks(

@@ -59,7 +59,7 @@ def draw_cloud(
 def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
     """Draw the left image and each cloud with its title in a grid of two columns.
 
-    All clouds are drawn from the same viewpoint and with the frame of the cloud with most points.
+    All clouds are drawn from the same viewpoint, framed by the box of the cloud with most points.
     """
     size = (width, max(1, round(width * left.shape[0] / left.shape[1])))
     shrinks = left.shape[1] > width

@@ -39,7 +39,7 @@ def profiled() -> Iterator[Profile]:
     global _highest
     _highest = peak_memory()
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
+        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, the peak
     profile, before, started = Profile(), _memory("VmRSS"), time.perf_counter()
     yield profile
     profile.seconds = time.perf_counter() - started

@@ -93,7 +93,7 @@ def _opencv(name: str) -> LocalFeature:
 
 
 def self_described(name: str) -> LocalFeature:
-    """Make a local feature that detects and also describes with these `OPENCV_SETTINGS`."""
+    """Make a local feature that detects and also describes with the `OPENCV_SETTINGS` of a name."""
     return replace(
         _opencv(name),
         name=f"{name}-self-described",
@@ -185,9 +185,9 @@ and Shi-Tomasi differ from `CLASSICAL` so that they find enough keypoints and ra
 
 
 def with_kd_trees(features: Iterable[LocalFeature]) -> list[LocalFeature]:
-    """After binary features with low settings, insert copies whose bytes are matched as numbers.
+    """After each binary feature with low settings, insert a copy that is matched by kd-trees.
 
-    In the paper, kd-trees match binary descriptors in this way, by the Euclidean distance of bytes.
+    As in the paper, kd-trees compare the bytes of binary descriptors by Euclidean distance.
     """
     found: list[LocalFeature] = []
     for feature in features:

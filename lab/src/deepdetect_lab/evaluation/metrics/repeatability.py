@@ -37,7 +37,7 @@ def repeatability_paper(
     """Return the repeatability as the paper's code computes it, clipped at 1.
 
     It is the number of points of the first image that the homography maps to less than the radius
-    from any point of the second, divided by the number of points in the image that has fewer.
+    from any point of the second, divided by the number of points in the image with fewer points.
     Points outside the overlap also count, and several points may share a partner.
     """
     fewest = min(len(points0), len(points1))

@@ -119,7 +119,7 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def score_samples(
     heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, MaskScore]:
-    """Score a function from RGB images to heat maps on images with masks, for each visibility."""
+    """Compare the heat maps that a function computes with masks; return scores by visibility."""
     return _by_visibility(
         (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
     )
@@ -201,7 +201,7 @@ class LabelDensityDetector:
 
     def __init__(self, detector: DeepDetect) -> None:
         self.detector = detector
-        seen = HeatmapOptions(detector.heatmap_options.resolution)  # labels are not flipped
+        seen = HeatmapOptions(detector.heatmap_options.resolution)  # without the option `tta`
         self.labels = LabelDetector(heatmap_options=seen)
 
     def heatmap(self, image: Any) -> np.ndarray:

@@ -161,7 +161,7 @@ def matches_table(
 
 
 def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the benchmark on the foreground: the fraction of keypoints on it, as in Table I."""
+    """Run the benchmark: the fraction of keypoints on the foreground, as in the paper's Table I."""
     images = load_foreground(run.folder("foreground"))
     features = options.density_features()
     rows = foreground_rows(run, features, images)

@@ -53,7 +53,7 @@ and nearer than this number of baselines. The value is so large that all points 
 BUDGET = 8192
 RATIO = 0.8
 GOOD_DEG = 5.0
-"""When methods are compared with SIFT pair by pair, poses with an error below this are correct."""
+"""A pose with an error below this counts as correct when a pair is compared with SIFT's pose."""
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
@@ -281,8 +281,8 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         "seconds": median(".2f", "seconds"),
     }
     note = (
-        f"{NOTE} Guided by: number of pairs whose matching a homography or a fundamental matrix "
-        "guided; unguided: pairs for which no geometry was trusted. Worse than SIFT: number of "
+        f"{NOTE} Guided by: number of pairs that a homography or a fundamental matrix guided; "
+        "unguided: pairs for which no geometry was trusted. Worse than SIFT: number of "
         f"pairs with an error of {GOOD_DEG:g}° or more, while SIFT's is under {GOOD_DEG:g}°; "
         "better: the reverse. Seconds: median time from images to matches."
     )

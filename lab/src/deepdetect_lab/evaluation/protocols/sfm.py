@@ -202,9 +202,9 @@ def _version(points: PointDetector) -> str:
 def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
     """Reconstruct a scene by a method, or read the result from the cache.
 
-    Returns the values of `run_method` and the "scene". The keys "true" and "estimated" hold the
-    result with these intrinsics: a dict of the "views" (registered cameras by file name) and of the
-    `MODEL_COLUMNS`.
+    Returns the values of `run_method` and the "scene". For true and
+    estimated intrinsics, the keys "true" and "estimated" hold a dict of the `MODEL_COLUMNS` and of
+    the "views", the registered cameras by file name.
     """
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
@@ -404,7 +404,7 @@ def _times() -> np.ndarray:
 
 
 def _unpacked(model: Any) -> Row:
-    """Return the values of a pycolmap model to cache. The model is None if mapping failed.
+    """Return the values of a pycolmap model, or empty and NaN values without a model.
 
     "poses" has a row for each registered image: 9 numbers of the rotation, 3 of the translation.
     """

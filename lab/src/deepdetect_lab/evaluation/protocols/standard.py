@@ -1,4 +1,4 @@
-"""Standard metrics on pairs with homographies, at equal numbers of keypoints, and chance levels."""
+"""Measure metrics on pairs with homographies, at equal numbers of keypoints, and compare chance."""
 
 from __future__ import annotations
 
