@@ -26,8 +26,8 @@ from .stereo_pipelines import ROUNDS, Pipeline, pipelines
 
 TRUTH_OFFSETS = {"dolls": 2}
 """Scenes whose true disparity map belongs to a viewpoint this number of stereo baselines to the
-left of the left image. Shifting the map to it lowers the photometric error between the
-images by over 30 %. Results are evaluated by both maps."""
+left of the left image. Shifting the map to the left image's viewpoint lowers the photometric error
+between the two images by over 30 %. Results are evaluated by both maps."""
 
 AS_IT_IS = ""
 SHIFTED = "ground truth shifted to its photographs"
