@@ -31,8 +31,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "foreground": ("paper", "foreground"),
     "low-visibility": ("planar", "low_visibility"),
 }
-"""The module of `protocols` and the name of its function for each benchmark. The module is only
-imported when the benchmark runs."""
+"""Module in `protocols` and function of each benchmark. Modules are imported when needed."""
 
 
 def run_benchmarks(
@@ -45,9 +44,8 @@ def run_benchmarks(
 ) -> Report:
     """Run the named benchmarks of `BENCHMARKS` and return one report.
 
-    The data folder has a subfolder for each data set, or it is itself the folder of the only data
-    set. If a data set is missing, only its benchmark fails; with a single benchmark, an ImageError
-    is raised. Without a cache folder no results are kept for later runs.
+    `data` has a subfolder for each data set, or is the folder of the only data set. If a data set
+    is missing, its benchmark fails. If only one benchmark is named, an ImageError is raised.
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
@@ -77,7 +75,6 @@ def run_benchmarks(
 
 
 def _weights(names: Sequence[str], options: BenchmarkOptions) -> dict[str, str]:
-    """Return metadata of a report: file names of the weights, with the start of their SHA-256."""
     files = {}
     if set(names) != {"middlebury"}:
         files["weights (SHA-256)"] = [options.detector.weights]

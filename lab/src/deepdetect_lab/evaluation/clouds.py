@@ -21,8 +21,7 @@ POINT_AREA = 1.5
 a surface with one point per image pixel has no gaps when it is seen from the side."""
 
 ZOOM = 2.2
-"""Zoom of the plot, because at 1 the box around a cloud without its outliers would fill less than
-half of the figure's width."""
+"""Zoom of the plot: at 1, the box around a cloud would fill less than half the figure's width."""
 
 
 def draw_cloud(
@@ -60,7 +59,7 @@ def draw_cloud(
 def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
     """Draw the left image and each cloud with its title in a grid of two columns.
 
-    All clouds are drawn from the same viewpoint and with the frame of the cloud with most points.
+    All clouds are drawn from the same viewpoint, framed by the box of the cloud with most points.
     """
     size = (width, max(1, round(width * left.shape[0] / left.shape[1])))
     shrinks = left.shape[1] > width

@@ -27,14 +27,13 @@ from .baselines.random import all_pixels_feature, random_feature
 
 PROTOCOLS = ("paper", "standard", "guided", "degraded")
 DEFAULT_PROTOCOLS = PROTOCOLS[:3]
-"""The default protocols do not include "degraded", because it takes long: it measures all features
-again for each of four degradations of the images."""
+"""The protocol "degraded" is left out: it repeats "standard" for each of four degradations."""
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
 
 BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
-"""All classical baselines by name: those of the paper, and those of the standard protocol alone."""
+"""All classical baselines by name: the paper's, and the Hessian ones of the standard protocol."""
 
 
 @suggest_keywords
@@ -44,15 +43,13 @@ class BenchmarkOptions:
 
     Attributes:
         detector: DeepDetect with the weights to evaluate.
-        protocols: names from `PROTOCOLS`: the sets of measurements to make on image pairs with
-            homographies.
+        protocols: names from `PROTOCOLS`: what to measure on image pairs with homographies.
         classical: names from `BASELINES`: the classical detectors to compare with.
         others: further local features to compare with, for example external ones.
-        channels: order of the colour channels in which DeepDetect gets images; the paper's code
-            uses "bgr".
-        geometry_weights: names or files of weights, of which each is evaluated on stereo pairs.
+        channels: order of the colours in DeepDetect's input; the paper's code uses "bgr".
+        geometry_weights: names or files of weights; each of them is evaluated on stereo pairs.
         max_pairs: largest number of image pairs per scene. If a scene has more, evenly spaced ones
-            are taken. 1 takes the last pair of a scene with homographies.
+            are taken. If it is 1, a scene with homographies gives its last pair.
         max_images: largest number of images per scene in structure from motion. If a scene has
             more, the first images of a sequence or evenly spaced other images are taken.
         ranker: npz file written by `deepdetect dev train-points`, with the network that ranks
@@ -85,7 +82,7 @@ class BenchmarkOptions:
             )
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
-        """Return DeepDetect as in the paper: images resized to 480x480, SIFT of size 3 px."""
+        """Return DeepDetect as in the paper: images of 480x480, SIFT descriptors of size 3 px."""
         return deepdetect_feature(
             self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)),
             SelectionOptions(threshold),
@@ -113,7 +110,7 @@ class BenchmarkOptions:
         return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
 
     def matching_features(self) -> list[LocalFeature]:
-        """Return the features of the paper's Table II, low-setting detectors and DeepDetect."""
+        """Return the features of the paper's Table II: low-setting detectors, and DeepDetect."""
         low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
         own = [self.deepdetect_480(), *self.chance_baselines()]
         return without_repeats([*low, *self.others, *own])

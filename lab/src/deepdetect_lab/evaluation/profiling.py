@@ -18,15 +18,14 @@ Outcome = TypeVar("Outcome")
 
 @dataclass
 class Profile:
-    """Wall time of a `profiled` block in seconds, and the growth of memory to its peak in bytes."""
+    """Seconds that a `profiled` block took, and bytes by which memory grew until its peak."""
 
     seconds: float = 0.0
     memory: float = 0.0
 
 
 _highest = 0
-"""Peak memory of the process, in bytes, up to the last reset of the operating system's counter of
-peak memory. `profiled` resets the counter."""
+"""Peak memory of the process in bytes, until `profiled` last reset the system's counter of it."""
 
 
 @contextmanager
@@ -35,12 +34,12 @@ def profiled() -> Iterator[Profile]:
 
     On Linux the memory is exact, because the counter of peak memory is reset when the block begins.
     Other systems cannot reset it, so growth is only measured if the block needs more memory than
-    the process ever had. Two blocks must not run at the same time.
+    the process has ever had. Two blocks must not run at the same time.
     """
     global _highest
     _highest = peak_memory()
     with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
+        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, the peak
     profile, before, started = Profile(), _memory("VmRSS"), time.perf_counter()
     yield profile
     profile.seconds = time.perf_counter() - started
@@ -68,8 +67,8 @@ def _memory(name: str) -> int:
 def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
     """Call a module-level function in a new process, so that `peak_memory` measures only its work.
 
-    In that process OpenCV and this package's kernels use one thread. If the function raises an
-    error, it is raised again here. If the process is killed, a DeepDetectError is raised.
+    OpenCV and this package's kernels use one thread in that process. If the function raises an
+    error, it is raised here. If the process is killed, a DeepDetectError is raised.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor

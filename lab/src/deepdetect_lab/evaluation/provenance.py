@@ -47,8 +47,7 @@ def _commit() -> str:
         return done.stdout.strip()
 
     try:
-        # This fails unless git tracks this file: the package may be installed in a folder that
-        # belongs to the repository of another project.
+        # This fails if git does not track this file: it may be installed in another project.
         git("ls-files", "--error-unmatch", __file__)
         changed = git("status", "--porcelain", "--", ":/src", ":/lab/src")
         return git("rev-parse", "HEAD") + ("+" if changed else "")

@@ -31,7 +31,7 @@ def where(rows: Iterable[Row], **wanted: Any) -> Rows:
 
 
 def mean(rows: Iterable[Row], name: Any) -> float | None:
-    """Return the mean of the rows' values `name`, without None and NaN; None if none is left."""
+    """Return the mean of the rows' values `name` that are neither None nor NaN; None if none is."""
     return mean_of(row[name] for row in rows)
 
 
@@ -90,7 +90,6 @@ class Table:
 
 
 def _shown(cell: Cell, style: str) -> str:
-    """Return the text of a cell; None and NaN become a dash."""
     if cell is None or cell != cell:
         return "–"
     return cell if isinstance(cell, str) else format(cell, style)
@@ -130,7 +129,7 @@ def tabulate(
     """Make a table from the rows of `Run.rows`, with one line for each method.
 
     Each of the `groups`, for example {"scene": "graf"}, gets its own lines, computed from the rows
-    that have its values. The first columns show these values.
+    that have the group's values. The first columns show these values.
     """
     lines = []
     for group in groups:
@@ -220,8 +219,7 @@ MARKERS = ("o", "s", "^", "x")
 DASHES = ("-", "--", ":", "-.")
 
 WIDEST = 1600
-"""Images that are wider than this are shrunk to this width in pixels for a report. Chosen by hand;
-not measured."""
+"""Images in a report are shrunk to at most this width in pixels. Chosen by hand."""
 
 
 def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
@@ -251,7 +249,7 @@ def line_chart(
     axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
     for k, (name, (x, y)) in enumerate(lines.items()):
-        # There are ten colours, so each ten lines get another marker and another dash pattern.
+        # There are only ten colours, so every ten lines the marker and the dash pattern change.
         marker, dash = MARKERS[k // 10 % len(MARKERS)], DASHES[k // 10 % len(DASHES)]
         axes.plot(x, y, label=name, color=f"C{k % 10}", marker=marker, linestyle=dash)
     if lines:

@@ -40,11 +40,8 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "pose": (9, ("matches", "guided")),
     "sfm": (4, ()),
 }
-"""Version of each stage of computation whose results are cached, and the stages that it builds on.
-
-Increase a stage's version whenever a change of the code changes its results. Otherwise outdated
-results of this stage, and of the stages that build on it, would be read from the cache.
-"""
+"""Version of each stage whose results are cached, and the stages that it builds on. Increase the
+version whenever the code's results change, or the cache would return outdated results."""
 
 RECENT_IMAGES = 8
 
@@ -57,9 +54,8 @@ class CacheError(DeepDetectError):
 class MatchSettings:
     """How the descriptors of two images are matched.
 
-    `matcher` is used for descriptors with Euclidean distance. Binary descriptors are always matched
-    exactly by Hamming distance. If there is a `budget`, only this number of best keypoints of each
-    image is matched.
+    `matcher` matches descriptors with Euclidean distance; binary ones are always matched exactly by
+    Hamming distance. If `budget` is set, only this number of best keypoints per image is matched.
     """
 
     matcher: str = "flann"
@@ -73,8 +69,8 @@ class MatchSettings:
 class PairMatches:
     """The M matches of two images: `points0[i]` matches `points1[i]`, (M, 2) positions each.
 
-    `keypoints0` and `keypoints1` are the positions of all keypoints that were to be matched.
-    `seconds` is the time for describing and matching, measured when they were not yet cached.
+    `keypoints0` and `keypoints1` are the positions of all keypoints that the matcher got. `seconds`
+    is the time that describing and matching took when the matches were computed.
     """
 
     points0: np.ndarray
@@ -89,8 +85,7 @@ class Run:
 
     Args:
         data: folder with a subfolder for each data set, or the folder of the only data set needed.
-        cache: folder for the results of stages. A file's name is a digest of all inputs of its
-            result. Damaged files are computed again. Old files are never removed. None: no cache.
+        cache: folder that keeps the results of stages; old files are never removed. None: no cache.
         quiet: show no progress bars.
 
     Attributes:
@@ -113,7 +108,7 @@ class Run:
 
     @cached_property
     def files_folder(self) -> Path:
-        """Folder for generated images: the cache folder, or without one a temporary folder."""
+        """Folder for generated images: the cache folder, or a temporary folder without a cache."""
         if self.cache is not None:
             return self.cache
         folder = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
@@ -123,9 +118,8 @@ class Run:
     def attempt(self, name: str, work: Callable[..., Result], *arguments: Any) -> Result | None:
         """Return what `work` returns for these arguments; if it fails, record why and return None.
 
-        Errors of data, of external detectors and of OpenCV are recorded. All other errors are
-        raised, because the cache is unusable or there is a bug. An OptionError is a bug here, since
-        the user's options were checked before the run.
+        Errors of data, of external detectors and of OpenCV are recorded. Other errors are raised:
+        the cache is unusable, or there is a bug, since all options were checked before the run.
         """
         try:
             return work(*arguments)
@@ -150,10 +144,9 @@ class Run:
     ) -> Rows:
         """Measure each method on each item, for example an image pair; return a row for each.
 
-        `items` is keyed by name. A method is any object with a name, and possibly a title. A row
-        has the names as "method" and "item", and the values that `measure(method, item)` returns.
-        Measurements that fail are recorded and have no row. `what`, for example "matches of ",
-        precedes the method in the texts of the progress bar and of failures.
+        `items` is keyed by name. A row holds the names as "method" and "item", and the values that
+        `measure(method, item)` returns. Failed measurements are recorded and have no row. `what`,
+        for example "matches of ", begins the names of measurements in progress bar and failures.
         """
         rows: Rows = []
         with progress(len(methods) * len(items), "benchmark", "task", self.quiet) as bar:
@@ -170,8 +163,8 @@ class Run:
     def cached(self, stage: str, depends: object, make: Callable[[], Row]) -> Row:
         """Read a result of one of `STAGES` from the cache, or else compute and cache it.
 
-        A result maps names to arrays, numbers or texts. `depends` holds all inputs of the result,
-        which identify it in the cache. A path among them stands for the content of its file.
+        A result maps names to arrays, numbers or texts. `depends` holds all inputs of a result,
+        which identify it. A path in `depends` stands for the content of its file.
         """
         path = None
         kept: Mapping[str, np.ndarray] | None = None
@@ -189,10 +182,7 @@ class Run:
         return {name: value if value.ndim else value.item() for name, value in kept.items()}
 
     def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, float]:
-        """Return the keypoints of an image and the seconds that detection took.
-
-        They are read from the cache if they are there.
-        """
+        """Return an image's keypoints and the seconds of detection, from the cache if possible."""
         name = f"{feature.detection} {file_digest(image)}"
         if name not in self._recent:
             self._recent[name] = self._keypoints(feature, image)
@@ -246,10 +236,7 @@ class Run:
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
     ) -> tuple[list[np.ndarray], float]:
-        """Return the descriptors of both images' keypoints, and the seconds for computing them.
-
-        The descriptors of the last pair stay in memory, to be matched again with other settings.
-        """
+        """Return the descriptors of two images and their seconds; keep them for the next call."""
         name = key(*feature.key, images, [len(keypoints) for keypoints in both])
         if self._described is None or self._described[0] != name:
             self._described = None  # frees the old descriptors before new ones are computed

@@ -15,12 +15,10 @@ from deepdetect.matching import match_features
 from .baselines.method import PAPER_DESCRIPTOR, PointDescriptor
 
 PAPER_RATIO = 0.99
-"""The paper's published code keeps a match if the ratio of the distances to the nearest and the
-second-nearest descriptor is under 0.99."""
+"""Threshold of the ratio test in the paper's published code."""
 
 UPRIGHT_SIFT = PointDescriptor(angle_deg=0.0)
-"""SIFT descriptor of the paper's size, but with angle 0. The paper's code leaves the angle at -1,
-which means "unset" in OpenCV, but OpenCV's SIFT takes it as an angle of -1 degree."""
+"""SIFT descriptor of the paper's size, but with the angle 0 instead of the paper's -1 degree."""
 
 
 def match_unguided(
@@ -40,8 +38,7 @@ def match_unguided(
     Args:
         image0, image1: images in any form that `load_image` accepts.
         detector: object with a method `heatmap` or `detect`.
-        selection: which pixels of a heat map become keypoints. None: all with a probability over
-            0.5.
+        selection: which pixels of a heat map become keypoints. None: all with a value over 0.5.
         descriptor: type, size and angle of the descriptors.
         matcher, ratio, mutual, seed: as in `match_features`.
     """

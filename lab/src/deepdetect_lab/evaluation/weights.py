@@ -40,7 +40,7 @@ class OxfordScore:
 
     Attributes:
         density: for each of the paper's thresholds, the number of keypoints per pixel, mean over
-            all images. With `equal_density` only the first threshold is a key.
+            all images. If `equal_density` is set, only the first threshold is used.
         repeatability: the paper's repeatability of each scene, mean over its five pairs.
         correct: for each pair, the number of matches (FLANN, ratio 0.99) with an error under 1 px
             by the published homography, mean over several seeds of FLANN.
@@ -60,10 +60,9 @@ class ForegroundScore:
     """How many keypoints are on the foreground of photographs, which are resized to 480x480.
 
     Attributes:
-        fraction: fraction of the keypoints that are on the foreground, mean over the photographs.
+        fraction: fraction of the keypoints on the foreground, mean over the photographs.
         density: keypoints per pixel, mean over the photographs.
-        covered: fraction of the pixels that are on the foreground, mean over the photographs.
-            Random keypoints would get this as their `fraction`.
+        covered: fraction of pixels on the foreground. Random keypoints would have this `fraction`.
         photographs: number of photographs with a keypoint. The means leave out the others.
         failures: a sentence for each photograph that could not be measured.
     """
@@ -81,12 +80,10 @@ class Evaluation:
 
     Attributes:
         masks: agreement of heat maps with known masks, by visibility ("normal" or "low").
-        scales: agreement of the heat maps of scaled images with labels made from these images, by
-            (scale, visibility).
+        scales: agreement of scaled images' heat maps with their labels, by (scale, visibility).
         oxford: scores by the paper's protocol on the Oxford scenes.
         foreground: scores on photographs with a known foreground.
-        failures: a sentence for each sample that `masks` and `scales` leave out, because it cannot
-            be used. `oxford` and `foreground` have their own failures.
+        failures: a sentence for each unusable sample, which `masks` and `scales` leave out.
     """
 
     masks: dict[str, MaskScore] = field(default_factory=dict)
@@ -120,10 +117,9 @@ def evaluate(
         oxford: folder of the eight Oxford scenes, for which repeatability and matches are measured.
         foreground: folder of photographs NAME.jpg with their foreground NAME_mask.png, for which
             the fraction of the keypoints on the foreground is measured.
-        equal_density: in each image of `oxford` and `foreground`, take as many keypoints as the
-            fusion label of the image marks pixels: the most probable ones, instead of all above the
-            threshold 0.5. This makes weights comparable, since larger sets of keypoints always
-            repeat and match more often.
+        equal_density: in each image of `oxford` and `foreground`, take the N most probable pixels
+            as keypoints, instead of all above 0.5. N is the number of pixels that the image's
+            fusion label marks. Otherwise weights with more keypoints would score higher.
         quiet: show no progress bars.
 
     Raises:
@@ -193,8 +189,7 @@ def evaluate_oxford(
 ) -> OxfordScore:
     """Evaluate weights, or any detector with a method `heatmap`, on scenes from `load_oxford`.
 
-    A DeepDetect gets images resized to 480x480, whatever its own resolution. If `equal_density`, it
-    takes as many keypoints in each image as the image's fusion label marks pixels.
+    A DeepDetect gets images resized to 480x480. `equal_density` is as in `evaluate`.
     """
     detector = _of_paper(detector, equal_density)
     features = [_feature(detector)]
@@ -248,10 +243,7 @@ def evaluate_foreground(
 
 
 def _of_paper(detector: Any, equal_density: bool) -> Any:
-    """Return a copy of a DeepDetect that resizes images to 480x480, as in the paper.
-
-    Detectors of other types are returned unchanged.
-    """
+    """Return a copy of a DeepDetect that resizes images to 480x480; return others unchanged."""
     if not isinstance(detector, DeepDetect):
         return detector
     options = replace(

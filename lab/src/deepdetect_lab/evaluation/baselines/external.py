@@ -1,16 +1,16 @@
 """Find detectors by name: a classical detector, an ONNX file, or an importable function.
 
 A function is named as "package.module:function". It takes an (H, W, 3) uint8 RGB image and returns
-a dict with `keypoints` (N, 2), `scores` (N,) and optionally `descriptors` (N, D). The function may
-have these attributes: `learned` (its descriptors need no ratio test), `binary` (its descriptors are
-compared by Hamming distance) and `version`. Change `version` whenever the results change, because
-the cache of results only notices changes in the module's own file.
+a dict with `keypoints` (N, 2), `scores` (N,) and optionally `descriptors` (N, D). It may have the
+attributes `learned` (its descriptors need no ratio test), `binary` (its descriptors are compared by
+Hamming distance) and `version`. Change `version` whenever the results change, because the cache of
+results only notices changes in the module's own file.
 
 An ONNX file has one input with values in [0, 1]: 1x3xHxW, an RGB image, or 1x1xHxW, the mean of the
 three channels. H and W may be fixed or free. There are two kinds of outputs:
 
-- lists, as in XFeat: the same `keypoints`, `scores` and `descriptors` as in the dict, where
-  positions are pixels of the input. They may have an additional leading dimension of 1.
+- lists, as in XFeat: `keypoints` in pixels of the input, `scores`, and optionally `descriptors`,
+  with the shapes given above. They may have an additional leading dimension of 1.
 - maps, as in EdgePoint2: `scores`, 1x1xHxW logits whose local maxima become the keypoints, and
   `descriptors`, 1xDxhxw, from which the descriptors of the keypoints are interpolated.
 
@@ -91,8 +91,7 @@ def onnx_feature(
     """Make a local feature from an ONNX file. The backend is "onnxruntime" or "openvino".
 
     Raises:
-        WeightsError: the file cannot be opened, or its inputs or outputs are not as described at
-            the top of this module.
+        WeightsError: the file cannot be opened, or lacks the inputs or outputs described above.
     """
     file = Path(path)
     try:
@@ -113,7 +112,7 @@ def onnx_feature(
 
 
 class _Network(NamedTuple):
-    """A loaded ONNX file. `shapes` are those of its inputs; a free dimension is not an int."""
+    """A loaded ONNX file. `shapes` has the shape of each input; a free dimension is not an int."""
 
     shapes: list[list[Any]]
     outputs: list[str]

@@ -15,16 +15,14 @@ from deepdetect.io.image import luma
 from .method import PAPER_DESCRIPTOR, LocalFeature, OwnScaleDescriptor
 
 SIGMA_PX = 3.0
-"""Gaussian sigma in pixels of the baseline with a single scale. Chosen by hand; not measured."""
+"""Gaussian sigma in pixels of the baseline with a single scale. Chosen by hand."""
 
 SIGMAS_PX = tuple(float(sigma) for sigma in np.geomspace(1.5, 9.1, 7))
-"""Gaussian sigmas in pixels of the baseline with several scales, each 1.35 times the one before.
-Chosen by hand; not measured."""
+"""Gaussian sigmas of the baseline with several scales, a factor of 1.35 apart. Chosen by hand."""
 
 NMS_RADIUS = 2
 DISTANCE_PX = 2.0
-"""Keypoints are at least this far apart, whether they have the same scale or not. Chosen by hand;
-not measured."""
+"""Keypoints of equal or different scales are at least this far apart. Chosen by hand."""
 
 SIZE_PER_SIGMA = 5.0
 """The size (diameter) of a keypoint is 5 times the sigma at which it was found."""
@@ -64,7 +62,7 @@ HESSIAN: dict[str, LocalFeature] = {
         title,
         detect,
         PAPER_DESCRIPTOR.describe,
-        own_scale=OwnScaleDescriptor(0.5),  # so its size is 2.5 sigma; in SIFT it is 2 sigma
+        own_scale=OwnScaleDescriptor(0.5),  # described at size 2.5 sigma; in SIFT 2 sigma
     )
     for name, title, detect in (
         ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),

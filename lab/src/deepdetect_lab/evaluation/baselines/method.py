@@ -33,11 +33,10 @@ class LocalFeature:
         describe: function from the image and its N keypoints to (N, D) descriptors.
         binary: descriptors are compared by Hamming distance instead of Euclidean distance.
         learned: descriptors were learned together with their detector and need no ratio test.
-        version: text that differs if anything besides the name changes the results. It is part of
-            the key of cached results.
-        detection: key of the cached keypoints. Features with the same detector share it. The
+        version: text that changes whenever the results change. It is part of the key in the cache.
+        detection: key of the cached keypoints, shared by features with the same detector. The
             default consists of name and version.
-        own_scale: descriptor that uses the keypoints' own sizes. None if they do not have sizes.
+        own_scale: descriptor that uses the keypoints' own sizes. None if keypoints have no sizes.
     """
 
     name: str
@@ -64,8 +63,7 @@ class LocalFeature:
 class PointDescriptor:
     """A descriptor with the same size and angle for all keypoints, by default those of the paper.
 
-    The paper's code leaves the angle at -1, which means "unset" in OpenCV. OpenCV's SIFT takes it
-    as an angle of -1 degree.
+    The paper's code leaves OpenCV's angle unset, at -1, which SIFT takes as -1 degree.
     """
 
     name: str = "sift"
@@ -88,8 +86,8 @@ their keypoints differ. External detectors get it if they have no descriptor of 
 class OwnScaleDescriptor:
     """RootSIFT descriptors at the keypoints' own sizes and angles.
 
-    Keypoints without angles get the angle of the dominant gradient around them. A descriptor covers
-    a square whose side is six times the size (diameter) of the keypoint times `size_factor`.
+    A descriptor covers a square with a side of 6 * `size_factor` * size (diameter) of the keypoint.
+    Keypoints without angles get the angle of the dominant gradient around them.
     """
 
     size_factor: float = 1.0
@@ -144,7 +142,7 @@ def deepdetect_feature(
     descriptor: PointDescriptor = PAPER_DESCRIPTOR,
     version: str = "",
 ) -> LocalFeature:
-    """Make a local feature from a DeepDetect, or from any detector with `heatmap` and a version."""
+    """Make a local feature from a DeepDetect. Other detectors need `heatmap` and a `version`."""
     if not version:
         digest = file_digest(detector.weights)[:16]
         version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"

@@ -60,8 +60,7 @@ def _make(name: str) -> cv2.Feature2D:
 def describe_with(descriptor: cv2.Feature2D, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
     """Compute an (N, D) array of OpenCV descriptors, one row per keypoint.
 
-    OpenCV leaves out some keypoints, for example ORB those near the border. Their rows are all 0,
-    which matches only by chance, so that the number of keypoints stays the same.
+    OpenCV drops some keypoints, for example near the border. Their descriptors are all 0.
     """
     dtype = np.uint8 if descriptor.descriptorType() == cv2.CV_8U else np.float32
     rows = np.zeros((len(features), descriptor.descriptorSize()), dtype)
@@ -94,7 +93,7 @@ def _opencv(name: str) -> LocalFeature:
 
 
 def self_described(name: str) -> LocalFeature:
-    """Make a local feature that detects and also describes with these `OPENCV_SETTINGS`."""
+    """Make a local feature that detects and also describes with the `OPENCV_SETTINGS` of a name."""
     return replace(
         _opencv(name),
         name=f"{name}-self-described",
@@ -105,11 +104,7 @@ def self_described(name: str) -> LocalFeature:
 def _harris(
     name: str, title: str, block_size: int, aperture: int, k: float, quality: float
 ) -> LocalFeature:
-    """Make a Harris detector (Harris and Stephens, 1988) that works as in the paper.
-
-    The response is dilated with a 3x3 window. Every pixel where it exceeds `quality` times the
-    largest response is a keypoint, so a corner gives several keypoints.
-    """
+    """Make the paper's Harris detector (Harris and Stephens, 1988): several points per corner."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
         response = cv2.dilate(cv2.cornerHarris(luma(rgb), block_size, aperture, k), None)
@@ -190,9 +185,9 @@ and Shi-Tomasi differ from `CLASSICAL` so that they find enough keypoints and ra
 
 
 def with_kd_trees(features: Iterable[LocalFeature]) -> list[LocalFeature]:
-    """After binary features with low settings, insert copies whose bytes are matched as numbers.
+    """After each binary feature with low settings, insert a copy that is matched by kd-trees.
 
-    In the paper, kd-trees match binary descriptors in this way, by the Euclidean distance of bytes.
+    As in the paper, kd-trees compare the bytes of binary descriptors by Euclidean distance.
     """
     found: list[LocalFeature] = []
     for feature in features:

@@ -21,8 +21,7 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return an (N,) bool mask of the (N, 2) points that are inside an image of (width, height).
 
-    The image extends half a pixel beyond the centres of its outer pixels. Points that are not
-    finite are outside.
+    The image ends half a pixel beyond its outer pixel centres. Non-finite points are outside.
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
     return np.all((points >= -0.5) & (points < np.asarray(size) - 0.5), axis=1)
@@ -33,9 +32,8 @@ def project_visible(
 ) -> np.ndarray:
     """Map (N, 2) points into another image. Points that the other image does not show become NaN.
 
-    A homography also maps points of the plane that are behind the other camera. They may land
-    inside its image, although it cannot show them. At these points the homography mirrors: the
-    determinant of its Jacobian, det(H) / depth^3, is negative. So they also become NaN.
+    Points behind the other camera also become NaN, even if the homography maps them into its image.
+    There the homography mirrors: the determinant of its Jacobian, det(H) / depth^3, is negative.
     """
     depth = np.asarray(points, np.float64).reshape(-1, 2) @ homography[2, :2] + homography[2, 2]
     mapped = transform_points(points, homography)
@@ -55,10 +53,10 @@ def match_accuracy(
 
     `keypoints0` and `keypoints1` are all keypoints, (N, 2), matched or not. Errors are distances in
     the second image. Returns the number of "matches", and three values for each threshold `px` from
-    1 to 10: ("correct", px) is the number of matches with an error of at most px. ("precision", px)
-    is their fraction of all matches, called matching accuracy by D2-Net. ("score", px) is
-    Mikolajczyk's matching score: the number of correct matches between points that both images
-    show, divided by the number of keypoints in the overlap, in the image that has fewer there.
+    1 to 10. ("correct", px): number of matches with an error of at most px. ("precision", px):
+    their fraction of all matches, which D2-Net calls matching accuracy. ("score", px):
+    Mikolajczyk's matching score, the number of correct matches of points that both images show,
+    divided by the smaller number of keypoints in the overlap.
     """
     errors = transfer_errors(points0, points1, homography)
     back = np.linalg.inv(homography)
@@ -103,8 +101,7 @@ def area_under_curve(errors: Sequence[float], threshold: float) -> float:
     """Return the area under the cumulative error curve (AUC) from 0 to a threshold, in [0, 1].
 
     The area is divided by the threshold. As in SuperGlue and glue-factory, straight lines connect
-    (0, 0) with the points (error, fraction of errors up to this one). With N errors the result
-    exceeds the area under the step function `accuracy_at` by at most 1 / (2 N).
+    (0, 0) with the points (error, fraction of errors up to this one).
     """
     if not len(errors):
         return 0.0

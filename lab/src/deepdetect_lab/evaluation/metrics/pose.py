@@ -13,16 +13,14 @@ from deepdetect.geometry.similarity import least_squares_similarity
 from deepdetect.geometry.transforms import epipolar_errors
 
 POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
-"""Thresholds of the AUC (area under the cumulative error curve) in degrees, as in SuperGlue's
-paper."""
+"""Thresholds of the AUC (area under the cumulative error curve), as in SuperGlue's paper."""
 
 LINE_WIDTH = 0.01
 """Camera centres count as collinear if their spread across a line is below this fraction of the
-spread along it. Chosen by hand; not measured."""
+spread along it. Chosen by hand."""
 
 EPIPOLAR_THRESHOLD_PX = 1.0
-"""A match agrees with the true pose if its Sampson distance in pixels is below this. Chosen by
-hand."""
+"""A match agrees with the true pose if its Sampson distance is below this. Chosen by hand."""
 
 
 def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
@@ -33,9 +31,8 @@ def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
 def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
     """Return the angle between the directions of two translations, in degrees from 0 to 180.
 
-    SuperGlue and glue-factory count the opposite direction as correct. Here its error is 180
-    degrees, because it would put the points behind the cameras. If the true translation is 0, the
-    error is 0.
+    SuperGlue and glue-factory accept the opposite direction. Here its error is 180 degrees, because
+    it would put the points behind the cameras. If the true translation is 0, the error is 0.
     """
     across = float(np.linalg.norm(np.cross(estimated, true)))
     return float(np.degrees(np.arctan2(across, np.dot(estimated, true))))
@@ -89,8 +86,7 @@ def relative_pose_errors(
     """Return the error of the relative pose for each pair of true cameras, in degrees.
 
     The error is the larger of the angular errors of rotation and translation. It is infinite if
-    the estimate of one of the two cameras is missing. Relative poses need no alignment with the
-    ground truth. `area_under_curve` summarises the errors.
+    the estimate of one of the two cameras is missing.
     """
     errors = []
     for pair in itertools.combinations(sorted(truth), 2):

@@ -1,9 +1,8 @@
 """Measure repeatability of keypoints, their coverage, and their fraction on the foreground.
 
-The repeatability has two definitions. In the paper's, several keypoints may share a partner in the
-other image, and all keypoints count, so a detector that marks every pixel scores best. With mutual
-nearest neighbours a keypoint has at most one partner, and only keypoints in the overlap of the two
-images count. For comparison, the chance level is the repeatability of as many random points.
+There are two definitions of repeatability. In the paper's, several keypoints may share a partner
+in the other image, so a detector that marks every pixel scores best. With mutual nearest
+neighbours, a keypoint has at most one partner, and only keypoints in the overlap count.
 """
 
 from __future__ import annotations
@@ -20,18 +19,16 @@ from deepdetect.geometry.transforms import transform_points
 from .homography import Sizes, project_visible
 
 CHANCE_POINTS = 20_000
-"""The chance level of few keypoints would be noisy. So random points are drawn repeatedly until
-their total number reaches this, and the level is the mean. Chosen by hand; not measured."""
+"""Random points are drawn repeatedly until their total number reaches this, because the chance
+level of few points would be noisy. Chosen by hand."""
 
 MAX_DRAWS = 100
-"""The chance level is the mean of at most this number of draws. Otherwise very few keypoints would
-need thousands of draws to reach `CHANCE_POINTS`."""
+"""Random points are drawn at most this often; few keypoints would need thousands of draws."""
 
 MIN_POINTS_FOR_THREADS = 20_000
 
 CELL_PX = 32
-"""`coverage` divides an image into square cells with this side in pixels. Chosen by hand; not
-measured."""
+"""Side of the square cells of `coverage` in pixels. Chosen by hand."""
 
 
 def repeatability_paper(
@@ -39,10 +36,9 @@ def repeatability_paper(
 ) -> float:
     """Return the repeatability as the paper's code computes it, clipped at 1.
 
-    It is the number of points of the first image that the homography maps strictly closer than the
-    radius to any point of the second, divided by the number of points in the image that has fewer.
-    Points outside the overlap of the images count, several points may share a partner, and the
-    chance level is not subtracted.
+    It is the number of points of the first image that the homography maps to less than the radius
+    from any point of the second, divided by the number of points in the image with fewer points.
+    Points outside the overlap also count, and several points may share a partner.
     """
     fewest = min(len(points0), len(points1))
     if not fewest:
@@ -63,11 +59,10 @@ def mutual_nn_repeatability(
 ) -> list[tuple[float, float, float]]:
     """Measure the repeatability by mutual nearest neighbours in the overlap of two images.
 
-    Returns three values for each radius. The first, the repeatability, is the number of pairs of
-    mutual nearest neighbours within the radius, divided by the smaller number of keypoints in the
-    overlap. The second, the chance level, is the repeatability of as many random points (at pixel
-    centres if all keypoints are), or NaN if it is not requested. The third is the mean distance
-    of the pairs in pixels, or NaN without pairs.
+    Returns (repeatability, chance level, distance) for each radius. Repeatability: number of pairs
+    of mutual nearest neighbours within the radius, divided by the smaller number of keypoints in
+    the overlap. Chance level: repeatability of as many random points, or NaN if not requested.
+    Distance: mean distance of the pairs in pixels, or NaN without pairs.
     """
     visible = _in_overlap(points0, points1, homography, sizes)
     distances = _mutual_distances(*visible, max(radii_px))
@@ -87,7 +82,7 @@ def mutual_nn_repeatability(
 def _in_overlap(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, sizes: Sizes
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of each image that the other image shows, in the second's coordinates."""
+    """Return the points of each image that the other one shows, in the second image's frame."""
     mapped = project_visible(points0, homography, sizes[1])
     back = project_visible(points1, np.linalg.inv(homography), sizes[0])
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -99,10 +94,7 @@ def _kd_tree(points: np.ndarray) -> Any:
 
 
 def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """For each point, return the distance to the nearest point of the tree, and its tree index.
-
-    Distances beyond the radius are infinite.
-    """
+    """Find the nearest tree point of each point: distance (inf beyond the radius) and index."""
     # An upper bound saves time. The tree leaves the bound itself out, so it must exceed the radius.
     bound = np.nextafter(radius_px, np.inf)
     workers = -1 if min(tree.n, len(points)) > MIN_POINTS_FOR_THREADS else 1
@@ -127,12 +119,11 @@ def _chance(
     radii_px: Sequence[float],
     on_pixels: bool,
 ) -> list[float]:
-    """Return the chance level for each radius: the repeatability of random points in the overlap.
+    """Return the repeatability of `counts` random points in the overlap, for each radius.
 
-    `counts` is the number of random points in each image. If `on_pixels`, they are at pixel
-    centres, as the keypoints are. This matters if the images hardly differ by motion: then points
-    at pixel centres have neighbours within 1 px more often than points elsewhere, because a circle
-    of this radius around a pixel centre contains five centres, but has an area of 3.14 pixels.
+    If `on_pixels`, the points are at pixel centres. They are repeated more often than other points
+    if nothing moves: a circle of 1 px around a pixel centre contains five centres, but has an area
+    of 3.14 pixels.
     """
     fewest = min(counts)
     if not fewest:
@@ -142,8 +133,7 @@ def _chance(
     draws = min(-(-CHANCE_POINTS // fewest), MAX_DRAWS)
     found = np.zeros(len(radii_px))
     for _ in range(draws):
-        # Classical detectors may find more keypoints than pixels, as they mark some pixels several
-        # times. Then random points are drawn with replacement.
+        # Detectors that mark a pixel several times may find more keypoints than there are pixels.
         drawn = [
             grid[generator.choice(len(grid), count, replace=count > len(grid))]
             for grid, count in zip(grids, counts, strict=True)
@@ -157,8 +147,6 @@ def _chance(
 
 @lru_cache(maxsize=2)  # a pair is measured at several numbers of keypoints with the same grids
 def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels of each image that the other image shows, in the second's coordinates."""
-
     def grid(size: tuple[int, int]) -> np.ndarray:
         row, column = np.indices((size[1], size[0]))
         return np.column_stack([column.ravel(), row.ravel()]).astype(np.float64)
@@ -168,10 +156,7 @@ def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.
 
 
 def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the fraction of an image's square cells that contain one of the (N, 2) keypoints.
-
-    `size` is (width, height). Cells at the right and lower border may be smaller than `CELL_PX`.
-    """
+    """Return the fraction of the `CELL_PX` cells of a (width, height) image with a keypoint."""
     columns, rows = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
     position = np.floor((np.asarray(xy, np.float64).reshape(-1, 2) + 0.5) / CELL_PX).astype(int)
     position = np.clip(position, 0, (columns - 1, rows - 1))
@@ -179,10 +164,7 @@ def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
 
 
 def foreground_fraction(xy: np.ndarray, foreground: np.ndarray) -> float:
-    """Return the fraction of (N, 2) keypoints on the foreground, an (H, W) bool mask.
-
-    The metric is defined in section IV-A of the paper. It is NaN without keypoints.
-    """
+    """Return the fraction of keypoints, (N, 2), on the (H, W) foreground mask; NaN if N is 0."""
     if not len(xy):
         return float("nan")
     height, width = foreground.shape

@@ -21,13 +21,12 @@ def disparity_scores(
 ) -> dict[str, float]:
     """Evaluate estimated disparities (N,) at pixels (N, 2) of the left image.
 
-    `truth` is the true disparity map of the left image, (H, W), NaN where unknown. Returns values
-    by column title. "1 - bad-t", the fraction of errors up to t pixels, and "EPE", the mean error,
-    are computed from the points with ground truth. The completeness is the fraction of pixels with
-    ground truth, occluded ones included, that have a point with an error of at most 1 px. The
-    F-score is the harmonic mean of "1 - bad-1" and the completeness. The last two values are the
-    number of points whose true counterpart is outside the right image, and the fraction of these
-    points with an error of at most 1 px.
+    `truth` is the true disparity map, (H, W), NaN where unknown. Returns values by column title.
+    "1 - bad-t": fraction of the points with ground truth that have an error up to t pixels. "EPE":
+    mean error of the points with ground truth. Completeness: fraction of the pixels with ground
+    truth that have a point with an error up to 1 px. F-score: harmonic mean of "1 - bad-1" and
+    completeness. Half-occluded: number of points whose true counterpart is outside the right image.
+    The last value is the fraction of these points that have an error up to 1 px.
     """
     disparity = np.asarray(disparity, np.float64)
     columns, rows = np.rint(np.asarray(pixels, np.float64).reshape(-1, 2)).astype(np.int64).T

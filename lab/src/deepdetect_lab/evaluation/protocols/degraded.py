@@ -20,10 +20,9 @@ from .standard import standard_section
 TEXT = (
     "The second image of each pair is replaced by a darkened or blurred copy; the first image is "
     "unchanged. Copies are simulated in linear light, with random numbers that are the same in "
-    "each run. In full light a white pixel receives 10,000 electrons, with 1/4 or 1/8 of the light "
-    "2,500 or 1,250. In dark copies, shot noise is Poisson noise and read noise has a standard "
-    "deviation of 3 electrons. Copies have 8 bits. Each image has its own random direction of "
-    "motion blur."
+    "each run. In full light a white pixel receives 10,000 electrons, and in dark copies 1/4 or "
+    "1/8 of them, with Poisson shot noise and a read noise of 3 electrons (standard deviation). "
+    "Copies have 8 bits. Each image has its own random direction of motion blur."
 )
 
 
@@ -44,7 +43,7 @@ def degraded_sections(
 
 
 def degraded_pair(pair: PlanarPair, degradation: Degradation, folder: Path) -> PlanarPair:
-    """Return the pair with a degraded copy of its second image, a file that is made if missing."""
+    """Replace the second image of a pair by its degraded copy; make the file if it is missing."""
     digest = file_digest(pair.second)[:16]
     path = folder / "degraded" / f"{digest}-{degradation.name}-v{degradation.version}.png"
     if not path.exists():

@@ -1,9 +1,8 @@
 """Measure which share of each image dense points cover, and how accurate their depths are.
 
-Without ground truth, the accuracy is estimated by reconstructing two halves of the images
-separately and comparing their depths. Two alternatives are measured in the same way: OpenCV's
-semi-global matching of image pairs that the same cameras rectify, and clouds that other programs,
-such as OpenMVS or COLMAP, made from the same model.
+The accuracy is estimated without ground truth: two halves of the images are reconstructed
+separately, and their depths are compared. OpenCV's semi-global matching and the clouds of other
+programs, such as OpenMVS or COLMAP, are measured for comparison.
 """
 
 from __future__ import annotations
@@ -35,8 +34,7 @@ from .stereo_pipelines import sgbm_disparity
 SGBM = "SGBM, OpenCV"
 
 APART = 0.01
-"""Two depths of a pixel are "apart", on different surfaces, if their relative difference is larger
-than this. Chosen by hand."""
+"""Two depths of a pixel are "apart" if their relative difference exceeds this. Chosen by hand."""
 
 DENSE_COLUMNS = {
     "scene": "",
@@ -51,9 +49,9 @@ DENSE_COLUMNS = {
 }
 
 DENSE_NOTE = (
-    "True intrinsics are used where they are known. Share, own map: fraction of the pixels of the "
-    "depth maps that have a point in the image's own depth map; share, all maps: fraction of them "
-    "that see any point of the fused cloud. Both are means over the images. Error: distance in "
+    "True intrinsics are used where they are known. Share, own map: fraction of the pixels of an "
+    "image that have a point in its own depth map; share, all maps: fraction of the pixels that "
+    "see any point of the fused cloud; both are means over the images. Error: distance in "
     "pixels between a point and the matches of the image whose depth map gave the point. Halves: "
     "every other image belongs to the first half, the rest to the second, and each half gets its "
     "own dense points. Where an image sees points of both halves, the columns give the relative "
@@ -65,8 +63,7 @@ DENSE_NOTE = (
 
 
 CELL_PX = 4
-"""Clouds are compared in square cells of an image with this side in pixels, since other programs
-reconstruct only every second pixel."""
+"""Clouds are compared in cells of this side in pixels, since some use only every second pixel."""
 
 CLOUD_COLUMNS = {
     "cloud": "",
@@ -173,11 +170,7 @@ def measure_dense_points(
 
 
 def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> Row:
-    """Return how much the two depth maps in each pair differ; the maps show the same view.
-
-    Unknown depths are infinite. The keys of the row begin with `name`. The row is empty if no pixel
-    has a depth in both maps.
-    """
+    """Compare the two depth maps in each pair; `name` begins the column titles of the result."""
     differences = []
     for first, second in pairs:
         both = np.isfinite(first) & np.isfinite(second)
@@ -194,11 +187,7 @@ def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> R
 def _sgbm_points(
     one: tuple[np.ndarray, PosedView], other: tuple[np.ndarray, PosedView], seen: np.ndarray
 ) -> np.ndarray:
-    """Match two images by OpenCV's semi-global matching; return the (N, 3) points.
-
-    Each image is given as its RGB pixels and its view. `seen` are the sparse points, (M, 3), which
-    determine the range of disparities.
-    """
+    """Match two images by SGBM, in the range of disparities of the sparse points `seen`, (M, 3)."""
     (rgb0, view0), (rgb1, view1) = one, other
     moved = view1.relative_to(view0)
     size, matrices = view0.camera.size, [view.camera.matrix for view in (view0, view1)]
@@ -219,8 +208,7 @@ def _sgbm_points(
             (rgb0, rgb1), matrices, (turn0, turn1), (first, second), strict=True
         )
     ]
-    # OpenCV rectifies cameras above each other so that matches are in the same column, and other
-    # cameras so that matches are in the same row. Disparities may be negative.
+    # OpenCV rectifies cameras above each other so that matches share a column instead of a row.
     axis = int(abs(second[1, 3]) > abs(second[0, 3]))
     if axis:
         views = [np.ascontiguousarray(view.transpose(1, 0, 2)) for view in views]
@@ -251,8 +239,8 @@ def _halves(sparse: SparseModel) -> list[SparseModel]:
 def read_ply_points(path: Path) -> np.ndarray:
     """Read the points of a PLY file from any program, (N, 3) float64, without non-finite ones.
 
-    The package plyfile reads them, because files from OpenMVS contain lists, on which the readers
-    of OpenCV, COLMAP and trimesh fail. An InvalidFileError is raised for other files.
+    The package plyfile reads them, because files of OpenMVS contain lists, on which the readers of
+    OpenCV, COLMAP and trimesh fail. Raises an InvalidFileError if it is not a PLY point cloud.
     """
     try:
         head, end, rest = path.read_bytes().partition(b"end_header")

@@ -1,7 +1,7 @@
 """Compare guided matching with matching by descriptors alone and with chance.
 
-Guided matching finds many correct matches even for random points. So counts for a detector only
-mean something in comparison with the counts for random points.
+Guided matching finds many correct matches even for random points. So the counts of a detector only
+mean something in comparison with the counts of random points.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ NOTE = (
     "maps to within this distance of a point of the second image. Guided: guided matching runs "
     f"with {SEEDS} seeds, and the columns show the run with the median number of correct matches. "
     '±: standard deviation of this number over the seeds. "Of the matchable": number of correct '
-    "matches divided by that of matchable points; lowest: the smallest such fraction of a seed. "
+    "matches divided by that of matchable points; lowest: the smallest of these over the seeds. "
     "Unique: correct matches, where each point of the second image counts once. A seed that finds "
     "no trusted geometry has no matches, as in match_images. Corner error: median over the seeds "
     "that a homography guided. Seconds: median time of guided matching without finding keypoints."
@@ -149,7 +149,7 @@ def _guided_cells(
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Name the models that guided the seeds, and the number of guided seeds if not all were."""
+    """Name the models that guided the seeds, and how many seeds were guided if not all were."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):

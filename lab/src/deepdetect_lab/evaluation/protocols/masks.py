@@ -18,12 +18,10 @@ from deepdetect.io.masks import load_mask
 from ...labels import LabelOptions, fuse, visibility_of
 
 EPSILON = 1e-7
-"""Probabilities are clipped to this distance from 0 and 1, because the loss takes their logarithm,
-which is infinite at 0. For comparison, float32 numbers just below 1 differ by 6e-8."""
+"""Probabilities are clipped to this distance from 0 and 1, because log(0) is infinite."""
 
 NUM_BINS = 20
-"""The calibration error sorts probabilities into this number of equally wide bins. Chosen by hand;
-not measured."""
+"""Number of equally wide bins of probabilities for the calibration error. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +33,9 @@ class MaskScore:
         iou: intersection over union of the mask and the heat map thresholded at 0.5, mean over the
             images. It is 1 for an image in which both are empty.
         images: number of images.
-        calibration_error: expected calibration error (Naeini et al., 2015) over all pixels: for
-            each bin of probabilities, the difference between the mean probability and the fraction
-            of pixels that the masks mark; the mean of these differences, weighted by pixels.
+        calibration_error: expected calibration error (Naeini et al., 2015). Probabilities of all
+            pixels are sorted into bins. For each bin, the mean probability is compared with the
+            fraction of pixels that masks mark. The error is the mean difference over pixels.
         density: fraction of the pixels of the images with a probability over 0.5 (keypoints).
         label_density: fraction of the pixels of the images that the masks mark.
     """
@@ -76,7 +74,7 @@ def measure_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> Measured:
 
 
 def mean_score(measured: Sequence[Measured]) -> MaskScore:
-    """Combine the measurements of images: loss and IoU by images, all other values by pixels."""
+    """Average the measurements of images: loss and IoU over images, other values over pixels."""
     loss = sum(loss for loss, _, _ in measured) / len(measured)
     iou = sum(iou for _, iou, _ in measured) / len(measured)
     pixels, probabilities, marked, predicted = np.sum([sums for *_, sums in measured], axis=0)
@@ -87,7 +85,7 @@ def mean_score(measured: Sequence[Measured]) -> MaskScore:
 
 
 CERTAIN_LOGIT = 200.0
-"""The probability of this logit is exactly 1 in float32, and that of the negative logit is 0."""
+"""The sigmoid of this logit is exactly 1 in float32, and the sigmoid of its negative is 0."""
 
 
 def sample_images(folder: str | Path) -> list[Path]:
@@ -121,14 +119,13 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def score_samples(
     heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, MaskScore]:
-    """Score a function from RGB images to heat maps on images with masks, for each visibility."""
+    """Compare the heat maps that a function computes with masks; return scores by visibility."""
     return _by_visibility(
         (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
     )
 
 
 def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScore]:
-    """Combine measured images to a score for each visibility, "normal" or "low", that occurs."""
     measured: dict[str, list[Measured]] = {"normal": [], "low": []}
     for visibility, one in images:
         measured[visibility].append(one)
@@ -149,9 +146,8 @@ def score_at_scale(
 ) -> dict[str, MaskScore]:
     """Scale (H, W, 3) images; score the weights by fusion labels computed from the scaled images.
 
-    The network processes images at their scaled size. Images are downscaled by area averaging and
-    upscaled by cubic interpolation. Returns a score for each visibility of images, "normal" and
-    "low"; images of low visibility are labelled with other settings.
+    The network processes images at their scaled size. Returns a score for each visibility that
+    occurs, "normal" or "low".
 
     Raises:
         ImageError: a scaled image has a side of under 16 pixels.
@@ -171,9 +167,8 @@ def score_at_scale(
 class LabelDetector:
     """A detector without a network, whose keypoints are the pixels that the fusion label marks.
 
-    It behaves like weights that predict the label perfectly. If real weights score higher, they do
-    so because they deviate from the label. With heat-map options the label is computed from the
-    resized image that a network would get, otherwise from the original image.
+    It behaves like weights that predict the label perfectly. With heat-map options the label is
+    computed from the resized image that a network would get, otherwise from the original image.
     """
 
     def __init__(
@@ -206,7 +201,7 @@ class LabelDensityDetector:
 
     def __init__(self, detector: DeepDetect) -> None:
         self.detector = detector
-        seen = HeatmapOptions(detector.heatmap_options.resolution)  # labels are not flipped
+        seen = HeatmapOptions(detector.heatmap_options.resolution)  # without the option `tta`
         self.labels = LabelDetector(heatmap_options=seen)
 
     def heatmap(self, image: Any) -> np.ndarray:

@@ -42,8 +42,7 @@ OXFORD_PAIRS = (
     *(("graf", 6), ("wall", 6), ("bikes", 6), ("leuven", 6), ("trees", 6), ("ubc", 6)),
     ("boat", 2),
 )
-"""The image pairs of the paper's Table II: the scene and the number of the second image. The first
-image always has number 1."""
+"""Image pairs of the paper's Table II: scene and number of the second image. The first is 1."""
 
 CORRECT_PX = 1.0
 """A match is correct if its transfer error under the true homography is strictly below this."""
@@ -51,8 +50,7 @@ CORRECT_PX = 1.0
 PAPER_MATCHING = MatchSettings(matcher="flann", ratio=0.99)
 
 SEEDS = 3
-"""Numbers of matches are averaged over this number of FLANN seeds, because FLANN's random trees
-change them by some per cent."""
+"""Number of FLANN seeds to average, because the random trees change counts by some per cent."""
 
 FEW_MATCHES = 1000
 MANY_SEEDS = 64
@@ -83,8 +81,7 @@ def density_table(
 ) -> Table:
     """Tabulate the keypoints per pixel: the mean over all images, and the mean of each scene.
 
-    If `with_paper`, the table also has the mean without the scene `NOT_IN_DENSITY`, and next to it
-    the numbers of the paper, which leaves out this scene.
+    If `with_paper`, the paper's means, which leave out `NOT_IN_DENSITY`, are shown next to ours.
     """
 
     def measure(feature: LocalFeature, item: tuple[str, Path]) -> Row:
@@ -112,7 +109,7 @@ def density_table(
 def repeatability_table(
     run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene], key: str
 ) -> Table:
-    """Tabulate the repeatability at 1 px as the paper defines it, by scene and as their mean."""
+    """Tabulate the paper's repeatability at 1 px: the mean of each scene, and of all scenes."""
 
     def over_scenes(own: Rows) -> Cell:
         return mean_of(mean(where(own, scene=s.name), "repeatability") for s in scenes)
@@ -164,7 +161,7 @@ def matches_table(
 
 
 def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the benchmark on the foreground: the fraction of keypoints on it, as in Table I."""
+    """Run the benchmark: the fraction of keypoints on the foreground, as in the paper's Table I."""
     images = load_foreground(run.folder("foreground"))
     features = options.density_features()
     rows = foreground_rows(run, features, images)
@@ -201,8 +198,7 @@ def foreground_rows(
     """Measure each feature on each photograph with a foreground mask.
 
     Rows hold the "fraction" of keypoints on the foreground (NaN without keypoints), the "density"
-    in keypoints per pixel, and "covered", the fraction of pixels on the foreground. Random
-    keypoints would have a "fraction" equal to "covered".
+    in keypoints per pixel, and "covered", the fraction of pixels on the foreground.
     """
 
     def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:
@@ -239,10 +235,7 @@ def correct_matches(
 
 
 def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> tuple[int, int]:
-    """Return the numbers of correct and of all matches, as rounded means over FLANN seeds.
-
-    If there are fewer than `FEW_MATCHES` correct ones, `MANY_SEEDS` seeds are used, else `SEEDS`.
-    """
+    """Return the numbers of correct and of all matches, as rounded means over FLANN seeds."""
     counts: list[tuple[int, int]] = []
     for seed in range(MANY_SEEDS):
         if seed == SEEDS and np.mean(counts, axis=0)[0] >= FEW_MATCHES:

@@ -39,8 +39,7 @@ KEYPOINT_SCENES = ("graf", "bikes", "leuven")
 GUIDED_PAIRS = (*paper.OXFORD_PAIRS, ("boat", 6), ("bark", 6))
 
 FIGURE_7_SCENES = 4
-"""Number of HPatches scenes to draw for Figure 7, half with changing light, half with changing
-viewpoint."""
+"""HPatches scenes drawn for Figure 7: half with changing light, half with changing viewpoint."""
 
 TRUTHS = {
     "published": (
@@ -57,10 +56,7 @@ NOTHING_MOVES = "Nothing moves between the images of a scene: the true homograph
 
 
 def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the chosen protocols on Oxford, for Tables I to III and Figures 1, 2, 4, 6 of the paper.
-
-    "refined" homographies are used as well, if their files exist.
-    """
+    """Run the chosen protocols on Oxford with published homographies, and refined ones if found."""
     folder = run.folder("oxford")
     by_truth = {"published": load_oxford(folder), "refined": load_oxford(folder, "refined")}
     for truth, of_truth in by_truth.items():
@@ -148,16 +144,12 @@ def _figures(
 def _drawn(
     run: Run, what: str, draw: Callable[[Any], Figure], items: Sequence[PlanarPair | PlanarScene]
 ) -> list[Figure]:
-    """Draw a figure of each item. If one cannot be drawn, record the reason and leave it out."""
     figures = [run.attempt(f"{what} of {item.name}", draw, item) for item in items]
     return [figure for figure in figures if figure is not None]
 
 
 def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the chosen protocols on HPatches, for the paper's Table III and Figure 7.
-
-    The standard protocol is run on all scenes, and also on the subset that D2-Net's paper uses.
-    """
+    """Run the chosen protocols on HPatches; "standard" also runs on D2-Net's subset of scenes."""
     found = load_hpatches(run.folder("hpatches"))
     scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]
     last = [scene.pairs[-1] for scene in scenes]

@@ -47,15 +47,13 @@ MIN_MATCHES = 6
 """Any five matches fit some essential matrix exactly, so at least one more is needed."""
 
 NO_FAR_POINTS = 1e9
-"""An essential matrix allows four poses. OpenCV chooses the one with most points in front of both
-cameras, but leaves out points farther away than this number of baselines. The value is so large
-that all points count."""
+"""OpenCV chooses one of an essential matrix's four poses by the points in front of both cameras
+and nearer than this number of baselines. The value is so large that all points count."""
 
 BUDGET = 8192
 RATIO = 0.8
 GOOD_DEG = 5.0
-"""When a method is compared with SIFT pair by pair, a pose counts as correct if its error is below
-this number of degrees."""
+"""A pose with an error below this counts as correct when a pair is compared with SIFT's pose."""
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
@@ -88,17 +86,16 @@ NOTE = (
 )
 
 Found = tuple[np.ndarray, np.ndarray, float, str]
-"""The matches of two images: their positions in the first and in the second image, (M, 2) each; the
-seconds that matching took; and the model that guided it, "homography", "fundamental" or "none". The
-model is "" for methods without guidance."""
+"""Positions of the M matches in the two images, (M, 2) each; the seconds of matching; and the model
+that guided it: "homography", "fundamental" or "none", or "" for methods without guidance."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMethod:
     """A method that the benchmark compares, with its title in the tables.
 
-    `match` finds the matches of two images. If it is None, the method guesses without images that
-    the camera moves straight ahead. `name` and `version` identify the results in the cache.
+    `match` finds the matches of two images. If `match` is None, the method guesses without images
+    that the camera moves straight ahead. `name` and `version` identify cached results.
     """
 
     name: str
@@ -155,7 +152,6 @@ def _match_unguided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
 
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
-    """Make a method that matches descriptors exactly, with a ratio test unless they are learned."""
     ratio, test = (math.inf, "no ratio test") if feature.learned else (RATIO, f"ratio {RATIO:g}")
     settings = MatchSettings("exact", ratio, mutual=True, budget=BUDGET)
 
@@ -172,8 +168,7 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
 def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
     """Measure a method on a pair, or read the result from the cache; return values by column title.
 
-    Errors are in degrees, and infinite if no pose was found. The guess without images has errors
-    but no other values.
+    Errors are in degrees, and infinite without a pose. The guess without images has only errors.
     """
     match = method.match
     images = (pair.first.path, pair.second.path)
@@ -219,10 +214,9 @@ def estimate_pose(
     """
     if len(points0) < MIN_MATCHES:
         return None
-    # The intrinsics of the images may differ, so positions are mapped to one camera for both. Its
-    # focal length is the mean of both and not 1, because OpenCV 5's MAGSAC is less accurate in
-    # normalised coordinates (SIFT on 87 pairs of a KITTI clip: median rotation error 0.13 instead
-    # of 0.05 degrees).
+    # The intrinsics may differ, so positions are mapped to one camera. Its focal length is the mean
+    # of both, because with 1 OpenCV 5's MAGSAC is less accurate (median rotation error of SIFT on a
+    # KITTI clip: 0.13 instead of 0.05 degrees).
     focal = float(np.mean([k[i, i] for k in (intrinsics0, intrinsics1) for i in (0, 1)]))
     camera = np.diag([focal, focal, 1.0])
     first = _of_camera(points0, intrinsics0, camera)
@@ -287,8 +281,8 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         "seconds": median(".2f", "seconds"),
     }
     note = (
-        f"{NOTE} Guided by: number of pairs whose matching a homography or a fundamental matrix "
-        "guided; unguided: pairs for which no geometry was trusted. Worse than SIFT: number of "
+        f"{NOTE} Guided by: number of pairs that a homography or a fundamental matrix guided; "
+        "unguided: pairs for which no geometry was trusted. Worse than SIFT: number of "
         f"pairs with an error of {GOOD_DEG:g}° or more, while SIFT's is under {GOOD_DEG:g}°; "
         "better: the reverse. Seconds: median time from images to matches."
     )

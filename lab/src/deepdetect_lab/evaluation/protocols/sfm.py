@@ -1,8 +1,7 @@
 """Evaluate structure from motion on scenes with known cameras, with different keypoints.
 
-The methods are DeepDetect's ranked points, SIFT, and random points. All run the stages of
-`reconstruct_many` with the same options. They differ in the keypoints, some also in the matches or
-in how tracks are made. Each runs in its own process, so that its memory can be measured.
+All methods run the stages of `reconstruct_many` with the same options. Each runs in its own
+process, so that its memory can be measured.
 """
 
 from __future__ import annotations
@@ -44,14 +43,12 @@ from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
 MIN_IMAGES = 3
 
 POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
-"""Thresholds in degrees of the AUC (area under the cumulative error curve). They are lower than in
-the benchmark on image pairs, since bundle-adjusted cameras are more accurate."""
+"""Thresholds of the pose AUC, lower than for image pairs since bundle adjustment is accurate."""
 
 DATABASE = "sift.db"
 
 OPTIONS = MultiViewOptions(pairs="exhaustive")
-"""Options for all methods: the defaults of `reconstruct_many`, except that all image pairs are
-matched."""
+"""Options of all methods: defaults of `reconstruct_many`, but all image pairs are matched."""
 
 KINDS = ("true", "estimated")
 MODEL_COLUMNS = {"sparse points": ",d", "track length": ".2f", "reprojection error, px": ".3f"}
@@ -79,16 +76,15 @@ COST_COLUMNS = {
 }
 
 TEXT = (
-    "The cameras of all images and sparse points are reconstructed by the stages of "
-    "`reconstruct_many`: every image pair is matched, COLMAP verifies the matches and estimates "
-    "cameras and points, tracks are refined, and a last bundle adjustment with a robust loss "
-    "follows. All methods have the same options. They run once with true and once with estimated "
-    "intrinsics; the true poses are only used for evaluation. Methods differ in the keypoints: the "
-    "ranked points of DeepDetect; as many random points with the same sizes; and pycolmap's SIFT "
-    "with its own matcher, at no more positions, some of which have two angles. SIFT runs once "
-    'with and once without refinement of its tracks. "Dense tracks" uses the ranked points with '
-    "the option `--matches dense`. In scenes where only GPS positions are known, the camera "
-    "centres are compared with these.",
+    "The stages of `reconstruct_many` reconstruct cameras and sparse points: every image pair is "
+    "matched, COLMAP verifies the matches and estimates cameras and points, tracks are refined, "
+    "and a last bundle adjustment has a robust loss. All methods have the same options. They run "
+    "once with true and once with estimated intrinsics; true poses are only used for evaluation. "
+    "Methods differ in the keypoints: the ranked points of DeepDetect; as many random points with "
+    "the same sizes; and SIFT of pycolmap, with its own matcher, at no more positions. SIFT runs "
+    'once with and once without refinement of its tracks. "Dense tracks" uses the ranked points '
+    "with the option `--matches dense`. If only the GPS positions of a scene are known, the camera "
+    "centres are compared with them.",
 )
 
 CAMERA_NOTE = (
@@ -121,7 +117,7 @@ class SfmMethod:
     """A method that the benchmark compares. `name` is its title in the tables.
 
     `find` writes the keypoints of a folder of images to a file, and `match` returns the matches of
-    image pairs. Both must be module-level functions, because another process runs them. `name` and
+    image pairs. Both functions must be module-level, because another process runs them. `name` and
     `version` identify cached results. If `chance` is set, the time of `find` is not reported. If
     `refined` is set, COLMAP's tracks are refined. `tracks` is the value of the option `matches`.
     """
@@ -178,10 +174,9 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def choose_images(scene: PosedScene, most: int) -> PosedScene:
-    """Return a scene with at most `most` images.
+    """Keep at most `most` images of a scene: the first of a sequence, otherwise evenly spaced ones.
 
-    They are the first images of a sequence, because evenly spaced frames of a long sequence would
-    not overlap. In scenes of unordered images they are evenly spaced.
+    Evenly spaced frames of a long sequence would not overlap.
     """
     sequence = bool(scene.pairs) and scene.pairs[0].frame_distance is not None
     images = scene.images[:most] if sequence else evenly_spaced(scene.images, most)
@@ -189,7 +184,7 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
-    """Return two methods with ranked points, two with SIFT if chosen, and the chance baseline."""
+    """Return two methods with ranked points, two with SIFT if chosen, and a chance baseline."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
     version, random = _version(points), "baseline: as many random points"
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
@@ -207,9 +202,9 @@ def _version(points: PointDetector) -> str:
 def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
     """Reconstruct a scene by a method, or read the result from the cache.
 
-    Returns the values of `run_method` and the "scene". The keys "true" and "estimated" hold the
-    result with these intrinsics: a dict of the "views" (registered cameras by file name) and of the
-    `MODEL_COLUMNS`.
+    Returns the values of `run_method` and the "scene". For true and
+    estimated intrinsics, the keys "true" and "estimated" hold a dict of the `MODEL_COLUMNS` and of
+    the "views", the registered cameras by file name.
     """
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
@@ -233,10 +228,7 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
 
 
 def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
-    """Measure the dense points of a scene: a row for DeepDetect, and one for OpenCV's SGBM.
-
-    The values are read from the cache if they are there.
-    """
+    """Measure dense points or read the values from the cache: rows for DeepDetect and SGBM."""
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
     known = {} if scene.located_only else cameras
@@ -291,11 +283,7 @@ Views = Mapping[str, PosedView]
 
 
 def _apart(views: Views, others: Views, truth: Views) -> float | None:
-    """Align the camera centres of two models, and return their mean distance.
-
-    The distance is in the unit of the ground truth. It is None if the models share fewer than
-    three images.
-    """
+    """Align two models; return the mean distance of camera centres, in the ground truth's unit."""
     names = sorted(set(views) & set(others))
     if len(names) < MIN_IMAGES:
         return None
@@ -352,10 +340,7 @@ def find_sift(stages: Stages, folder: Path) -> None:
 
 
 def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-    """Match SIFT keypoints by pycolmap's matcher with its defaults, without verification.
-
-    A later stage verifies the matches of all methods in the same way.
-    """
+    """Match SIFT by pycolmap's matcher with its defaults. A later stage verifies all matches."""
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureMatchingOptions()
         how.num_threads = 1
@@ -377,9 +362,8 @@ def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
 def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, Camera]) -> Row:
     """Reconstruct images by a method. Call it in a separate process.
 
-    `cameras` are the true intrinsics by file name. Returns the `COST_COLUMNS` and the values of
-    `_unpacked`, once with the prefix "true " and once with the prefix "estimated ", for the
-    reconstructions with true and with estimated intrinsics.
+    `cameras` are the true intrinsics by file name. Returns the `COST_COLUMNS` and, for true and
+    estimated intrinsics, the values of `_unpacked` with the prefix "true " or "estimated ".
     """
     with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
         options = replace(OPTIONS, matches=method.tracks)
@@ -420,10 +404,9 @@ def _times() -> np.ndarray:
 
 
 def _unpacked(model: Any) -> Row:
-    """Return the values of a pycolmap model that are cached. The model may be None, if it failed.
+    """Return the values of a pycolmap model, or empty and NaN values without a model.
 
-    They are the "names" of the N registered images, their "poses", (N, 12) with the 9 numbers of
-    the rotation and the 3 of the translation in a row, and the `MODEL_COLUMNS`.
+    "poses" has a row for each registered image: 9 numbers of the rotation, 3 of the translation.
     """
     columns: Row = {**dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
     if model is None:

@@ -1,4 +1,4 @@
-"""Standard metrics on pairs with homographies, at equal numbers of keypoints, and chance levels."""
+"""Measure metrics on pairs with homographies, at equal numbers of keypoints, and compare chance."""
 
 from __future__ import annotations
 
@@ -40,15 +40,13 @@ from ..report import (
 from ..run import MatchSettings, Run
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
-"""Methods are compared at each of these budgets: the number of best keypoints that are taken from
-each image. None takes all keypoints."""
+"""Numbers of best keypoints per image at which methods are compared. None takes all keypoints."""
 
 RADII_PX = (1.0, 2.0, 3.0)
 SEEDS = 5
 MATCHING_BUDGET = 2048
 RATIO = 0.85
-"""Threshold of the ratio test for descriptors that are not learned. Chosen by hand; not
-measured."""
+"""Threshold of the ratio test for descriptors that are not learned. Chosen by hand."""
 
 INLIER_THRESHOLD_PX = 3.0
 
@@ -57,8 +55,7 @@ MIN_FILLED = 0.9
 budget, because otherwise the numbers of keypoints would differ between methods. Chosen by hand."""
 
 MAX_CHANCE = 0.95
-"""Chance-corrected values are left out if the chance level is above this, since the correction
-divides by 1 minus the chance level."""
+"""Values are not corrected above this chance level, since the correction divides by 1 - chance."""
 
 MATCHING_NOTE = (
     f"The best {MATCHING_BUDGET:,} keypoints of each image are matched by mutual nearest "
@@ -102,15 +99,13 @@ def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
     """Measure a feature on an image pair.
 
     Returns:
-        Values by name. "kind" is the kind of change in the pair. For each budget,
-        ("keypoints", budget) is the number of keypoints in the image that has fewer, and
-        ("coverage", budget) is the coverage of the first image. For each budget and radius, there
-        are the three values of `mutual_nn_repeatability`: ("repeated", budget, radius), the
-        repeatability; ("chance", budget, radius), its chance level; and
-        ("localization", budget, radius), the mean distance. "matches", ("correct", px),
-        ("precision", px) and ("score", px) are the values of `match_accuracy`. The number of
-        matches without a ratio test is "all matches", and their precision is ("accuracy", px).
-        "corner errors" is a list with the corner error for each seed of MAGSAC.
+        Values by name. "kind": kind of change in the pair. ("keypoints", budget): number of
+        keypoints in the image that has fewer. ("coverage", budget): coverage of the first image.
+        ("repeated", budget, radius), ("chance", budget, radius) and ("localization", budget,
+        radius): the values of `mutual_nn_repeatability`. "matches", ("correct", px), ("precision",
+        px) and ("score", px): the values of `match_accuracy`. "all matches" and ("accuracy", px):
+        number and precision of the matches without a ratio test. "corner errors": a list with the
+        corner error for each seed of MAGSAC.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0] for image in images)
@@ -144,7 +139,7 @@ def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
         **{("accuracy", px): without_ratio["precision", px] for px in MATCH_THRESHOLDS_PX},
         "corner errors": run.cached("corner_errors", depends, corner_errors)["errors"].tolist(),
     }
-    # SIFT repeats some positions with other orientations. For repeatability each counts once.
+    # SIFT repeats some positions with other orientations. For repeatability a position counts once.
     places = [first.distinct(), second.distinct()]
     for budget in BUDGETS:
         row |= _at_budget(run, feature, pair, places, budget)
@@ -303,11 +298,11 @@ COVERAGE_COLUMNS: Columns = {budget_name(b): average(".3f", ("coverage", b)) for
 REPEATABILITY_NOTE = (
     "The columns are numbers of best keypoints per image (budgets). Repeatability: number of pairs "
     "of keypoints that are mutual nearest neighbours and at most the radius apart, divided by the "
-    "number of keypoints in the overlap of the images, in the image that has fewer there; several "
-    "keypoints at one position count once; mean over the image pairs. Chance: the same for as many "
-    "random points. Chance-corrected: 0 is as good as chance, and 1 means that all keypoints are "
-    f"repeated; a dash if chance is over {MAX_CHANCE:.0%}. All three have a dash if a method finds "
-    f"under {MIN_FILLED:.0%} of the budget. Localization: mean distance in such pairs of keypoints."
+    "smaller number of keypoints in the overlap of the images; mean over the image pairs. Several "
+    "keypoints at one position count once. Chance: repeatability of as many random points. "
+    "Chance-corrected: 0 is as good as chance, and 1 means that all keypoints are repeated; a dash "
+    f"if chance is over {MAX_CHANCE:.0%}. All three are dashes if a method finds under "
+    f"{MIN_FILLED:.0%} of the budget. Localization: mean distance in such pairs of keypoints."
 )
 
 KIND_NOTE = (

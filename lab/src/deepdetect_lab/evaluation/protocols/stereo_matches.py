@@ -22,9 +22,8 @@ def score_stereo_matches(
     """Match rectified pairs with the keypoints of several detectors, and evaluate the matches.
 
     `sources` maps names to detectors. Descriptors are matched over the whole image, without using
-    the rectification or the true disparity. Returns a row for each detector and pair. The rows of a
-    detector are followed by those of random points at the same density, because more keypoints
-    always find more matches. Rows for matching all pixels come last.
+    the rectification. Returns a row for each detector and pair. A detector is followed by random
+    points at its density, because more keypoints always find more matches. All pixels come last.
     """
     rows: list[dict[str, Any]] = []
     with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
@@ -54,5 +53,5 @@ def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None 
 
 
 def match_random_points(pair: StereoPair, density: float) -> Matches:
-    """Match random points as a chance baseline. `density` is their number per pixel."""
+    """Match random points as a chance baseline. `density` is the number of points per pixel."""
     return match_stereo(pair, RandomDetector(), max(density, 1e-6))

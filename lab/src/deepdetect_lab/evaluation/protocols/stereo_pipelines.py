@@ -30,9 +30,8 @@ ROUNDS = 3
 """Pipelines that take only seconds run this number of times, and their median time is reported."""
 
 Points = tuple[np.ndarray, np.ndarray, int]
-"""The result of a pipeline: positions of points in the left image in pixels, (N, 2) float32; their
-disparities in pixels, (N,) float32; and the number of disparities that were filled in instead of
-matched."""
+"""The result of a pipeline: pixels of points in the left image, (N, 2); their disparities, (N,);
+and the number of disparities that were filled in instead of matched."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +140,8 @@ def paper_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match a stereo pair as the paper does; return the matched positions in both images, (M, 2).
 
-    The matches are the inliers of the essential matrix, which the paper calls voxels. Their number
-    depends on the random choices of RANSAC: another seed of FLANN's trees, or another order of the
-    matches, changes it by up to 1 %.
+    The matches are the inliers of an essential matrix, which the paper calls voxels. Their number
+    varies by up to 1 % with the seed, because FLANN and RANSAC choose at random.
     """
     images = scene.left, scene.right
     ratio, camera_matrix = paper_settings(scene)
@@ -162,7 +160,7 @@ def paper_points(
 def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
     """Return the threshold of the ratio test and the (3, 3) camera matrix for a scene.
 
-    They are those of `PAPER_SETTINGS`. Other scenes get the ratio 0.9 and their own camera matrix.
+    Scenes that are not in `PAPER_SETTINGS` get the ratio 0.9 and their own camera matrix.
     """
     camera = scene.calibration.camera0.matrix
     own = 0.9, camera[0, 0], camera[0, 2], camera[1, 2]
