@@ -61,8 +61,7 @@ class TrainingResult:
         onnx: ONNX file with the same weights; None for a ranker.
         points: points of the training curves: losses and measures by name, for each validation.
         best: the point of the best weights.
-        images_per_second: mean speed of the training, counted in images of 480x480 pixels; 0 if it
-            is on pairs of views.
+        images_per_second: mean speed, in images of 480x480 pixels; 0 for training on pairs.
     """
 
     weights: Path

@@ -25,9 +25,9 @@ from .recipe import TrainingOptions
 class View:
     """A view of an image for the network: shorter side in pixels, light and shape.
 
-    `square` is None if it shows the whole image, "crop" for the central square, and "squash" for
-    the image resized to a square. If `augmentation` is given, the view instead shows a square part
-    with random augmentations, of which this is the seed.
+    `square` is None if the view shows the whole image, "crop" for the central square, and "squash"
+    for the image resized to a square. If `augmentation`, a seed, is given, the view instead shows a
+    square part of the image with random augmentations.
     """
 
     short_side: int
@@ -137,14 +137,13 @@ def train_val_split(
 ) -> tuple[list[SourceImage], list[SourceImage]]:
     """Split images into training images and about the given fraction of validation images.
 
-    A checksum of its file name decides for each image, so that the image stays in its part when
-    other images are added.
+    The checksum of an image's file name decides, so that the image stays in its part when other
+    images are added.
     """
     training: list[SourceImage] = []
     validation: list[SourceImage] = []
     for image in images:
-        # `list_images` selects images by the same checksum. With reversed bits, the split is
-        # independent of that selection.
+        # Reversed bits make the split independent of `list_images`, which uses the same checksum.
         draw = int(f"{zlib.crc32(image.path.name.encode()):032b}"[::-1], 2) / 2**32
         (validation if draw < val_fraction else training).append(image)
     if not validation:

@@ -153,10 +153,8 @@ class DescriptorTrainer(Trainer):
         self.milestones = milestones(options.steps, options.val_count)
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
-
-        The pairs are those that no earlier step has used, or None if there are none.
-        """
+        """Return a loader of (step, numbers, pairs), with the pairs that no earlier step used or
+        None."""
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(
             PairDataset(self.files, self.options),

@@ -18,13 +18,12 @@ from ..recipe import PointsTrainingOptions
 from .views import KINDS, ViewPair, draw_pair
 
 MAX_CANDIDATES = 2000
-"""Views give at most this number of candidates, the strongest. Chosen by hand; not measured."""
+"""At most this number of candidates is kept in a view, the strongest ones. Chosen by hand."""
 
 REACH_PX = 3.0
 
 MIN_OVERLAP = 0.04
-"""Pairs whose views overlap by less than this fraction are drawn again. Chosen by hand; not
-measured."""
+"""Pairs whose views overlap by less than this fraction are drawn again. Chosen by hand."""
 
 ATTEMPTS = 5
 
