@@ -130,8 +130,7 @@ LabelTask = tuple[int, Path, dict[View, Path], bool]
 def _make_labels(
     task: LabelTask, options: LabelOptions
 ) -> tuple[LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
-    """Write an image's labels; return the task, the (image, label) of each view, and an error or
-    ""."""
+    """Write the labels; return the task, the (image, label) of each view, and an error or ""."""
     _, file, labels, keep = task
     made = {}
     try:
@@ -283,6 +282,6 @@ def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
         raise type(error)(text.splitlines()[-1].partition(": ")[2]) from None
     finally:
         # After an error, the traceback keeps the iterator alive. The garbage collector would later
-        # delete the queues of the processes first, and ending the processes would take five seconds.
+        # delete the processes' queues first, and ending the processes would take five seconds.
         if loader.num_workers and batches is not None:
             batches._shutdown_workers()

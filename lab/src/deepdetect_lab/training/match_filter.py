@@ -50,7 +50,7 @@ OF_A_MATCH, OF_TWO = 4, 11
 
 RATIO_RANGE, RATIO_SCALE, RATIO_OFFSET = (0.05, 1.2), 3, 0.5
 """The distance ratio of a match, as in the ratio test, is clipped to `RATIO_RANGE`. The feature
-`RATIO_SCALE` * log(ratio) + `RATIO_OFFSET` has a mean near 0 and a deviation near 1."""
+`RATIO_SCALE` * log(ratio) + `RATIO_OFFSET` has mean 0 and standard deviation 1, approximately."""
 
 MEAN_COSINE = 0.7
 """Approximate mean of an input feature, the cosine of the rotation between matched keypoints. It is
@@ -61,8 +61,8 @@ LEAST_TRUST = 0.5
 number. So the result is near 0 if all weights are near 0. Chosen by hand."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
-"""Side and largest number of keypoints of the square views, and the least number of matches of a
-pair: one more than the neighbours of a match (`AROUND`)."""
+"""Side of the square views in pixels, their largest number of keypoints, and the least number of
+matches of a pair: one more than the neighbours of a match (`AROUND`)."""
 
 UNRELATED = 7
 """Every 7th pair shows two unrelated scenes. The two descriptors alternate between pairs, so the
@@ -80,8 +80,8 @@ WEIGHT_DECAY = 0.01
 """Weight decay of AdamW, the default of torch."""
 
 LEFT_OUT_SHARE, FEWEST_SHARE = 0.5, 0.02
-"""Matches are left out at random in the share `LEFT_OUT_SHARE` of the pairs. At least
-`FEWEST_SHARE` of them stay: only 2 %, since the filter is meant for pairs with few matches."""
+"""Matches are left out at random in the share `LEFT_OUT_SHARE` of the pairs. At least the share
+`FEWEST_SHARE` of the matches stays: only 2 %, because the filter is for pairs with few matches."""
 
 TURNED_SHARE = 0.3
 """Share of the pairs in which both images are rotated by the same random angle. Chosen by hand."""
@@ -94,7 +94,7 @@ Sample = tuple[dict[str, np.ndarray], np.ndarray]
 
 
 class MatchFilter(nn.Module):
-    """A network that returns, for each match, the logit of the probability that it is correct."""
+    """A network that returns, for each match, its logit: positive if it is likely correct."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -152,7 +152,7 @@ class MatchFilter(nn.Module):
         away0, away1 = (each.square().sum(2).sqrt() for each in (there0, there1))
         middle = AROUND // 2
         unit = (away0[:, middle] * away1[:, AROUND + middle]).sqrt()[:, None, None] + 1
-        # The offsets that a match's own size change and rotation predict in the second image.
+        # The offsets in the second image that a match's own size change and rotation predict.
         (x, y), c, s = there0.unbind(2), cosine[:, None], sine[:, None]
         expected = torch.stack([c * x - s * y, s * x + c * y], 2) * growth.exp()[:, None, None]
         lengths = [there0, there1, 2 * (there1 - there0), 2 * (there1 - expected)]
@@ -165,8 +165,7 @@ class MatchFilter(nn.Module):
 
 
 def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
-    """Draw a pair of views, match their keypoints, and return the network's inputs and the
-    errors."""
+    """Draw a pair of views, and match their keypoints; return the matches as a `Sample`."""
     rng = np.random.default_rng([seed, number])
     detector = PointDetector(KEYPOINTS, descriptor=(LEARNED, ROOT_SIFT)[number % 2])
 

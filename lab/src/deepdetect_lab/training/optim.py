@@ -33,7 +33,7 @@ INITIAL_POWER_ITERATIONS = 3
 def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
     """Make the optimisers that together train a network's parameters.
 
-    "adam" is Adam for all. "soap" is SOAP for kernels, and Adam for biases and other vectors.
+    "adam" is Adam for all parameters. "soap" is SOAP for kernels, and Adam for vectors (biases).
     """
     if name == "adam":
         return [torch.optim.Adam(network.parameters(), fused=True)]
@@ -68,7 +68,7 @@ class KernelOptimizer(Optimizer):
 class Soap(KernelOptimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 
-    The first step only computes the first eigenbasis. SOAP of the package pytorch-optimizer is not
+    The first step only computes the first eigenbasis. The SOAP of the package pytorch-optimizer is not
     used, because its state also holds lists and numbers.
     """
 
@@ -114,7 +114,7 @@ def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
         basis = torch.eye(len(state[side]), device=gradient.device)
         for _ in range(INITIAL_POWER_ITERATIONS):
             basis = torch.linalg.qr(state[side] @ basis)[0]
-        # Contiguous, as from a checkpoint, because rounding in products depends on the layout.
+        # The basis is made contiguous, as in a checkpoint, because rounding depends on the layout.
         state[f"{side}_basis"] = basis.contiguous()
     return state
 

@@ -231,7 +231,7 @@ class PointsTrainingOptions:
         side: side of the square views, in pixels.
         learning_rate: highest learning rate; cosine annealing ends at 2 % of it.
         min_density, max_density: smallest and largest number of keypoints per pixel that the ranker
-            learns to choose. Each pair gets a number in between, log-uniformly distributed.
+            learns to choose. The number for a pair is drawn log-uniformly between them.
         val_count: number of validations, besides one before the first step.
         val_pairs: number of validation pairs of each kind: zoom, blur, viewpoint, light.
         seed: seed of the weights and the pairs.

@@ -36,44 +36,45 @@ SIDE_PX = 256
 """Default side of the square views, for which `PERSPECTIVE` is given. Chosen by hand."""
 
 MARGIN_PX = 6
-"""Keypoints closer to a view's border are not used, because their surroundings are cut off."""
+"""Keypoints closer than this to a view's border are not used: their surroundings are cut off."""
 
 OFFSET_PX = 90.0
 """The centre of the first view is up to 90 pixels from the photograph's centre along each axis. So
 every part of a photograph with sides of 480 pixels is seen by some views."""
 
 SCALE = Effect(1, math.log(0.6), math.log(1.5))
-"""Log of the first view's scale, in photograph pixels per view pixel. Chosen by hand."""
+"""Range of the first view's log scale (photograph pixels per view pixel). Chosen by hand."""
 
 SCALE_LIMITS = (0.42, 1.8)
-"""Limits of the scale of both views, in photograph pixels per view pixel, if the zoom allows.
-Smaller scales would look blurred. Larger ones would mostly show mirrored borders of the
-photograph."""
+"""The scales of both views, in pixels of the photograph per pixel of the view, are brought into
+this range if the zoom between the views allows. Views with a smaller scale would be blurred. Views
+with a larger scale would mostly show the mirrored borders of the photograph."""
 
 ZOOMS = (Effect(1, -0.2, 0.2), Effect(0.5, -math.log(2.1), math.log(2.1)))
 FAR_ZOOM = Effect(0.18, math.log(1.8), math.log(4.2))
-"""Logarithm of the zoom from the first to the second view. If several effects happen, the last
-counts. `FAR_ZOOM` enlarges or reduces; a descriptor trained on less zoom was worse on zoomed
-images."""
+"""Ranges of the logarithm of the zoom from the first to the second view. If several of these
+effects happen, the last one counts. `FAR_ZOOM` enlarges or reduces, with equal probability. It is
+used because a descriptor that was trained on less zoom was worse on zoomed images."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
 """The first number of each pair is for the rotation of the first view, the second for the rotation
 between the views. `ROTATED_SHARES` are the shares of rotations by any angle. All other angles have
-the standard deviations `UPRIGHT_DEVIATIONS` in radians (8 degrees, like hand-held cameras)."""
+the standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees)."""
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
-"""The tilt of a view is the ratio of its scales along two axes. In `NORMAL_TILT` of the second
-views, its logarithm is normal with the standard deviation `TILT_DEVIATION`. In all others, it is
-uniform up to `LARGEST_TILT`: a plane seen at 66 degrees, beyond which little can be described."""
+"""The tilt of a view is the ratio of its scales along two axes. In the share `NORMAL_TILT` of the
+second views, its logarithm is normally distributed with the standard deviation `TILT_DEVIATION`. In
+all other second views, the logarithm is uniform up to the tilt `LARGEST_TILT`, at which a plane is
+seen at 66 degrees. Beyond it, little of the plane can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
-"""The tilt in a first view exceeds 1, no tilt, by at most these values. `FIRST_TILT` is for the
-scene, `FRONT_TILT` for the parts in front."""
+"""In first views, the tilt exceeds 1, which means no tilt, by at most these values: `FIRST_TILT`
+for the scene, `FRONT_TILT` for the parts in front."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
 """Standard deviation of both perspective coefficients of a homography, per pixel of a view with
-`SIDE_PX` pixels a side. It changes the scale by 11 % from the middle to a border. In first views,
-the coefficients are multiplied by `FIRST_PERSPECTIVE`."""
+`SIDE_PX` pixels a side. Such a coefficient changes the scale by 11 % from the middle to a border.
+In first views, the coefficients are multiplied by `FIRST_PERSPECTIVE`."""
 
 SHIFT_DEVIATION = 18.0
 """Standard deviation of the second view's shift, in pixels of the first view. Chosen by hand."""
@@ -83,9 +84,9 @@ RELIEF_SHARE, RELIEF_PX = 0.45, (1.5, 5.0)
 displacements, in pixels, is drawn from the range `RELIEF_PX`."""
 
 SMOOTH_CELLS = (3, 8)
-"""Reliefs and parts in front are interpolated from 3 to 7 random values along a side. With more
-values, reliefs could not be inverted, and parts would be smaller than the area around a
-keypoint."""
+"""Reliefs and the outlines of parts in front are interpolated from 3 to 7 random values along a
+side. With more values, a relief could not be inverted, and parts in front would be smaller than the
+area that describes a keypoint."""
 
 FRONT_SHARE, FRONT_COUNTS, OTHER_PHOTOGRAPH_SHARE = 0.5, (1, 1, 2, 3), 0.8
 """`FRONT_SHARE` is the share of the scenes with parts in front. The number of these parts is drawn
@@ -101,19 +102,19 @@ axis in photograph pixels, and standard deviations of the log scale and of the a
 
 MOTION_SHIFT, MOTION_SCALE, MOTION_ANGLE, MOTION_TILT = 22.0, 0.12, 0.06, 0.15
 """Standard deviations of the motion of a part in front, relative to the scene, between the views:
-shift in pixels of the first view, logarithm of the scale, angle in radians, logarithm of the
-tilt."""
+shift in pixels of the first view, log scale, angle in radians, and log tilt."""
 
 ALIASED_SCALE, PIXEL_SIGMA = 1.15, 0.5
-"""A photograph that is reduced by a factor above `ALIASED_SCALE` is first blurred, against
-aliasing. With pixels as Gaussians of sigma `PIXEL_SIGMA`, the blur widens photograph to view
-pixels."""
+"""A photograph that is reduced by a factor above `ALIASED_SCALE` is blurred before it is sampled,
+against aliasing. A pixel is treated as a Gaussian with a sigma of `PIXEL_SIGMA` pixels. The blur
+widens the Gaussian of a pixel of the photograph to that of a pixel of the view."""
 
 COVERED = 0.5
 """A part in front counts as visible in a pixel if it covers more than this share of the pixel."""
 
 STEP_PX = 2.0
-"""Step, to either side, of central differences. Much smaller steps would suffer from rounding."""
+"""Derivatives of the map between the views are central differences over this step to either side,
+in pixels. Much smaller steps would suffer from rounding."""
 
 ATTEMPTS = 200
 """A scene is drawn up to this number of times, until its views share enough keypoints. If they
@@ -188,8 +189,7 @@ class Pose:
     def draw_matrix(
         self, rng: np.random.Generator, side_px: int, perspective: float = 1
     ) -> np.ndarray:
-        """Draw the homography from view to photograph, with random perspective and tilt
-        direction."""
+        """Draw the homography from view to photograph with a random perspective and tilt axis."""
         azimuth, root = rng.uniform(0, math.pi), math.sqrt(self.tilt)
         linear = rotation(self.angle) @ scaled_along(azimuth, root, 1 / root) * self.scale
         bend = perspective * SIDE_PX / side_px * rng.normal(0, PERSPECTIVE, 2)

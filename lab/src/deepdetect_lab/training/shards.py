@@ -50,8 +50,7 @@ Files = tuple[tuple[Path, int], ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """A folder of shards: for each its path, which holds a digest of its content, and its image
-    count."""
+    """A folder of shards: path and number of images of each. File names hold a content digest."""
 
     folder: Path
     training: Files
@@ -246,8 +245,7 @@ def _files_of(
 
 @functools.lru_cache(maxsize=64)
 def _read_members(path: Path) -> list[tuple[str, dict[str, tuple[int, int]]]]:
-    """List the images of a shard: the key of each, and the offset and size in bytes of its
-    files."""
+    """List a shard's images: the key of each, and the offset and size in bytes of its files."""
     samples: dict[str, dict[str, tuple[int, int]]] = {}
     try:
         with tarfile.open(path, "r:") as tar:

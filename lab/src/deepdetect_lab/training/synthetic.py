@@ -224,8 +224,10 @@ def rotation(angle: float) -> np.ndarray:
 
 
 def scaled_along(azimuth: float, along: float, across: float) -> np.ndarray:
-    """Return the (2, 2) scaling by `along` at angle `azimuth` (radians), by `across`
-    orthogonally."""
+    """Return the (2, 2) matrix that scales by `along` in a direction, by `across` at right angles.
+
+    `azimuth` is the angle of the direction in radians.
+    """
     return rotation(azimuth) @ np.diag([along, across]) @ rotation(-azimuth)
 
 

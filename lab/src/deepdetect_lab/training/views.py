@@ -108,7 +108,7 @@ def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray
 
 
 def label_key(options: LabelOptions) -> str:
-    """Return a digest of the label settings. A label depends on these, the image and the view."""
+    """Return a digest of the label settings, which determine a label together with the view."""
     names = options.detectors
     return key({n: [options.parameters(n, "normal"), options.parameters(n, "low")] for n in names})
 
@@ -118,7 +118,7 @@ def list_images(
 ) -> list[SourceImage]:
     """List the images in a folder, recursively.
 
-    If there are more than `limit`, checksums of their file names decide which ones are used.
+    If there are more than `limit` images, checksums of the file names decide which are used.
     """
     paths = find_images(root, exclude)
     if limit is not None and len(paths) > limit:

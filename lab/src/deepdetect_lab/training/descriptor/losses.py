@@ -62,10 +62,10 @@ def contrastive_loss(
 ) -> Tensor:
     """Return the symmetric InfoNCE loss, the cross-entropy of the true match among all keypoints.
 
-    Half of the pairs are mirrored. The descriptors of the second view are rotated back by the
-    rotation between the views at each keypoint, with random errors like those of a detector, times
-    `counted` (`angles_counted`). Half of the pairs rotated by less than `UPRIGHT` are not rotated
-    back, because in use upright images are described without rotation.
+    Half of the pairs are mirrored. The descriptors of the second view are rotated back by `counted`
+    (see `angles_counted`) times the rotation between the views at each keypoint, with random errors
+    like those of a detector. Half of the pairs that are rotated by less than `UPRIGHT` are not
+    rotated back, because in use upright images are described without rotation.
     """
     device, count = batch.turns.device, len(batch.turn)
     mirrored, kept = torch.from_numpy(generator.random((2, count)) < 0.5).to(device)

@@ -26,8 +26,8 @@ of feature maps, from 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`)."""
 DIMENSIONS = CONSTANT + 2 * len(FREQUENCIES)
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
-"""Keypoints up to this size are described by the feature maps of the full image. For larger
-keypoints, the samples of the two octaves that are nearest in size are also interpolated."""
+"""A keypoint up to this size is described by feature maps of the full image only. For a larger
+keypoint, the maps of the two octaves nearest to its size are interpolated and used as well."""
 
 SMALLEST_SIZE_PX = 2.5
 NOISE = 1 / 255
@@ -35,8 +35,7 @@ NOISE = 1 / 255
 normalisation by local contrast does not amplify them to full contrast."""
 
 CELL_PX, CELLS = 8, 5
-"""Local contrast is computed in a square of 5x5 cells of 8x8 pixels. Chosen by hand; not
-measured."""
+"""Local contrast is computed in a square of 5x5 cells of 8x8 pixels. Chosen by hand."""
 
 BATCH_MOMENTUM = 0.1
 

@@ -153,8 +153,10 @@ class DescriptorTrainer(Trainer):
         self.milestones = milestones(options.steps, options.val_count)
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of (step, numbers, pairs), with the pairs that no earlier step used or
-        None."""
+        """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
+
+        `pairs` are those that no earlier step has used, or None; `numbers` are their numbers.
+        """
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(
             PairDataset(self.files, self.options),

@@ -32,15 +32,15 @@ from ..synthetic import (
 
 KEYPOINTS = 256
 """A pair has at most this many keypoints, because the loss compares all keypoints of one view with
-all keypoints of the other view. They are enough to fill a view."""
+all keypoints of the other view. This number is enough to fill a view."""
 
 LEAST_KEYPOINTS, LEAST_IF_ZOOMED, ZOOMED = 64, 40, 0.8
 """Pairs whose views share fewer than `LEAST_KEYPOINTS` keypoints are drawn again. If the absolute
 logarithm of the zoom between the views is above `ZOOMED`, the limit is `LEAST_IF_ZOOMED`."""
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
-"""Candidates of the first view are used if their sigma is below `MAX_FIRST_SIGMA_PX`, at most the
-`STRONGEST` best. Areas around larger candidates do not fit into a view of 256 pixels."""
+"""Candidates of the first view are used if their sigma is below `MAX_FIRST_SIGMA_PX`, but at most
+the `STRONGEST` best. Areas around larger candidates do not fit into a view of 256 pixels."""
 
 SIGMA_RANGE_PX = (1.0, 13.0)
 """Keypoints are left out if their sigma in the second view is not in this range. Smaller keypoints
@@ -56,7 +56,7 @@ changed, to simulate a repeatable detector. `RANDOM_SHARE` is the share of the p
 random keypoints instead of the strongest."""
 
 JITTER_PX = 0.5
-"""Keypoints in the first view are moved at random by up to half a pixel, like rounded positions."""
+"""Keypoints in the first view are moved at random by up to half a pixel, as rounding would do."""
 
 SIZE_ERRORS, SMALL_ERROR_SHARE = (0.12, 0.4), 0.6
 """Keypoint sizes in the second view get random errors. The standard deviation of the log size is
@@ -88,8 +88,8 @@ CAMERA = Camera(
 values that occur in use. How much each of the ranges contributes was not measured."""
 
 CROSS_MODAL_SHARE, MIXED_SHARE = 0.6, 0.45
-"""`CROSS_MODAL_SHARE` of the pairs for the cross-modal descriptor have changed tones in one view
-(`change_tones`). `MIXED_SHARE` have mixed colour channels in one view (`draw_mixture`), or both."""
+"""`CROSS_MODAL_SHARE` of the cross-modal pairs have changed tones in one view (`change_tones`).
+`MIXED_SHARE` have mixed colour channels in one view (`draw_mixture`). A pair may have both."""
 
 ONE_COLOUR_SHARE, MIXTURE_DEVIATION, LEAST_WEIGHT = 0.4, 0.6, 0.5
 """A mixture is a single colour channel with the probability `ONE_COLOUR_SHARE`. Otherwise its three

@@ -18,7 +18,7 @@ CLOSE_PX, NEAR_PX = 1.0, 3.0
 
 SHARPNESS = 25.0
 """The logits of a view's keypoints are scaled to this standard deviation before the loss, so that
-larger logits alone do not lower it."""
+larger logits alone do not lower the loss."""
 
 TEMPERATURE = 0.6
 """Temperature of the sigmoid that maps scaled logits to probabilities. Chosen by hand."""
@@ -28,7 +28,7 @@ CLOSE_SHARE = 0.7
 of its reward if it is found again within 3 px."""
 
 MIN_CHOICE = 0.1
-"""Candidates with a smaller probability to be chosen get no partner. Chosen by hand."""
+"""Candidates chosen with a smaller probability are not matched between views. Chosen by hand."""
 
 MIN_SPREAD = 1e-3
 BISECTIONS = 40
@@ -56,8 +56,7 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
 
 
 def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
-    """Return the probability (N,) to choose each candidate: 0 beside a close one with a larger
-    logit."""
+    """Return the probability (N,) to choose a candidate: 0 if a close one has a larger logit."""
     logits = ranker(torch.from_numpy(view.features))
     radii = least_distances(view.sigma_px)  # the same as in detection
     kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))

@@ -53,8 +53,7 @@ def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPai
 
 
 def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
-    """Return the "score" of a detector, and its measures for each kind of pair as "KIND
-    MEASURE"."""
+    """Return the "score" of a detector, and its measures by kind of pair as "KIND MEASURE"."""
     repeated: dict[str, list[list[list[float]]]] = {kind: [] for kind in KINDS}
     correct: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:

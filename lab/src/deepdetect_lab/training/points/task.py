@@ -148,8 +148,7 @@ class RankerTrainer(Trainer):
         )
 
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
-        """Return the mean loss of pairs: 0 for a pair of which a view has fewer than two
-        candidates."""
+        """Return the mean loss of pairs, 0 for those with fewer than two candidates in a view."""
         losses = [
             pair_loss(self.network, pair)
             for pair in batch

@@ -40,7 +40,8 @@ MAX_ENLARGEMENT = 2.2
 """Zoomed views enlarge the photograph by at most this factor, because more would only show blur."""
 
 SUBTLE = 0.25
-"""Probability of each weak change (blur, light, JPEG) in views of another kind. Chosen by hand."""
+"""Probability of a weak blur in views of a kind other than "blur". The same holds for weak changes
+of light and weak JPEG compression. Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),
@@ -106,7 +107,7 @@ CHANGES = {
 scenes: a viewpoint change of 60 degrees and a zoom of 4."""
 
 LEAST_LOG_ZOOM = math.log(1.3)
-"""Zooms up to this logarithm are allowed even if they enlarge more than `MAX_ENLARGEMENT`."""
+"""Zooms up to this logarithm may enlarge the photograph by more than `MAX_ENLARGEMENT`."""
 
 ROTATED_SHARE = 0.2
 """Share of the pairs in which one random rotation is added to both views. Chosen by hand."""
