@@ -62,11 +62,11 @@ number. So the result is near 0 if all weights are near 0. Chosen by hand."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
 """Side of the square views in pixels, their largest number of keypoints, and the least number of
-matches of a pair: one more than the neighbours of a match (`AROUND`)."""
+matches of a pair: one more than a match has neighbours (`AROUND`)."""
 
 UNRELATED = 7
-"""Every 7th pair shows two unrelated scenes. The two descriptors alternate between pairs, so the
-number is odd: unrelated pairs occur with each descriptor."""
+"""Every 7th pair shows two unrelated scenes. Pairs alternate between the two descriptors. The
+number is odd, so that unrelated pairs occur with each descriptor."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
 """A match with an error below `RIGHT_PX` is correct. A match with an error above `WRONG_PX` is
@@ -94,7 +94,7 @@ Sample = tuple[dict[str, np.ndarray], np.ndarray]
 
 
 class MatchFilter(nn.Module):
-    """A network that returns, for each match, its logit: positive if it is likely correct."""
+    """A network that returns a logit for each match, positive if the match is likely correct."""
 
     def __init__(self) -> None:
         super().__init__()

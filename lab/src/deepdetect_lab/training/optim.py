@@ -68,8 +68,8 @@ class KernelOptimizer(Optimizer):
 class Soap(KernelOptimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 
-    The first step only computes the first eigenbasis. The SOAP of the package pytorch-optimizer is not
-    used, because its state also holds lists and numbers.
+    The first step only computes the first eigenbasis. The SOAP of the package pytorch-optimizer is
+    not used, because its state also holds lists and numbers.
     """
 
     def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:

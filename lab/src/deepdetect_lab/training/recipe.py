@@ -369,7 +369,7 @@ PRESETS: dict[str, TrainingOptions] = {
         val_count=20,
     ),
     # For two-view geometry, like the paper's second weights (Figure 8): labels mark more pixels,
-    # and all views are in normal light. It is meant to start from trained weights.
+    # and all views are in normal light. The recipe is meant to start from trained weights.
     "dense": TrainingOptions(
         dark_fraction=0.0, labels=LABEL_SETTINGS["dense"], learning_rate=1.5e-3
     ),

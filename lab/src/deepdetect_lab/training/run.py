@@ -62,7 +62,7 @@ def train(
             to start from; several are averaged. None: random weights by the seed.
         device: device, precision, compilation and processes.
         workers: number of processes that make labels. None: one per processor.
-        log: called with each line of text for the user. None: no text, and no progress bars.
+        log: function that gets each line of text for the user. None: no text, and no progress bars.
 
     Returns:
         The weights' files and the loss curves.
@@ -112,9 +112,10 @@ def train_on_pairs(
         init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file.
             None: random weights by the seed.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
-        num_workers: number of processes that generate pairs; 0: the training process does. None: 0,
-            or one less than the number of processors on a GPU. A match filter uses all processors.
-        log: called with each line of text for the user. None: no text, and no progress bars.
+        num_workers: number of processes that generate pairs; with 0, the training process does it.
+            None: 0, or for a descriptor on a GPU, one less than the number of processors. A match
+            filter always uses all processors.
+        log: function that gets each line of text for the user. None: no text, and no progress bars.
 
     Returns:
         The files of the weights, and the training curves. `PointDetector` reads the weights of

@@ -68,8 +68,8 @@ all other second views, the logarithm is uniform up to the tilt `LARGEST_TILT`, 
 seen at 66 degrees. Beyond it, little of the plane can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
-"""In first views, the tilt exceeds 1, which means no tilt, by at most these values: `FIRST_TILT`
-for the scene, `FRONT_TILT` for the parts in front."""
+"""`FIRST_TILT` is for the scene, `FRONT_TILT` for the parts in front. The tilt in first views
+exceeds 1, which means no tilt, by at most these values."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
 """Standard deviation of both perspective coefficients of a homography, per pixel of a view with

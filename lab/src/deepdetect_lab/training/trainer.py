@@ -113,7 +113,7 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches for steps `first` to `last` - 1; None: to the end."""
+        """Return a loader of the batches for steps `first` to `last` - 1 (None: to the end)."""
 
     def pixels(self, batch: Any) -> int:
         """Return the number of pixels in a batch, from which the speed is computed; 0: no speed."""
@@ -248,7 +248,7 @@ class Trainer(abc.ABC):
         state = TrainingState(**{name: metadata[name] for name in names})
         restore(tensors, self.network, self.average, self.optimizers)
         if state.points:
-            self.read_notes(folder / self.weights_file)  # if the file is missing, fail now
+            self.read_notes(folder / self.weights_file)  # fails now if the file is missing
         return state
 
     def _inputs(self) -> dict[str, Any]:

@@ -29,7 +29,7 @@ ONNX = "descriptor.onnx"
 
 REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
 """Each pair is used in `REUSE` steps on average, because drawing a pair takes longer than training
-on it. A step chooses from the last `WINDOW` pairs, the first step from `FIRST_BATCHES` batches."""
+on it. Steps choose from the last `WINDOW` pairs, at first from `FIRST_BATCHES` batches of pairs."""
 
 WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
 """The learning rate rises over `WARM_UP_STEPS` steps, but at most over the share `WARM_UP_SHARE` of
