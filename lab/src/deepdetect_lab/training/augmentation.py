@@ -32,22 +32,19 @@ class Darkening:
 
 
 BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
-"""Ranges from which the two factors of a `Darkening` are drawn. The product of the factors stays
-below 0.25. So a darkened image spans fewer than 64 of the 256 grey levels, which counts as low
-visibility (`visibility_of`)."""
+"""Ranges of the two factors of a `Darkening`. The product of the factors is below 0.25, so a
+darkened image spans fewer than 64 of the 256 grey levels: low visibility (`visibility_of`)."""
 
-# What `augment` draws from.
 TURN_PROBABILITY = 0.5
-"""Share of the augmented views that are rotated by an arbitrary angle. The others are only rotated
-by multiples of 90 degrees, because the interpolation for other angles blurs the view."""
+"""Share of the augmented views that are rotated by an arbitrary angle. All other views are rotated
+by multiples of 90 degrees, because the interpolation for other angles blurs a view."""
 
 CROP_SCALE = (0.7, 1.0)
-"""Range of the side of the cropped square, as a fraction of the largest square that fits into the
-image. Chosen by hand; not measured."""
+"""Range of the cropped square's side, in units of the largest possible side. Chosen by hand."""
 
 INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
-"""Names of OpenCV's interpolations, `cv2.INTER_...`. One is drawn at random whenever a view that is
-not rotated by an arbitrary angle is downscaled."""
+"""Names of OpenCV's interpolations, `cv2.INTER_...`. If a view is not rotated by an arbitrary
+angle, one of them is drawn at random to downscale it."""
 
 LIGHT = Light(
     share=0.5,
@@ -111,8 +108,7 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
     cosine, sine = saturation * math.cos(angle), saturation * math.sin(angle)
     blue, red = blue_range * (cosine * blue - sine * red), red_range * (sine * blue + cosine * red)
     green = -(RED * red + BLUE * blue) / GREEN
-    # For each pixel, the largest difference of a channel from grey, divided by the largest
-    # difference that fits into uint8.
+    # In each pixel: the largest difference from grey, divided by the largest that fits uint8.
     above = np.maximum(np.maximum(red, green), blue) / np.maximum(255 - gray, 1e-6)
     below = np.minimum(np.minimum(red, green), blue) / np.minimum(-gray, -1e-6)
     scale = 1 / np.maximum(np.maximum(above, below), 1)

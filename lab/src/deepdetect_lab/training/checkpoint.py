@@ -85,10 +85,7 @@ def restore(
 
 
 def _like(value: Tensor, parameter: Tensor) -> Tensor:
-    """Copy an optimiser's moment to the device of its parameter.
-
-    A moment with the parameter's shape also gets its memory layout, which fused Adam requires.
-    """
+    """Copy a moment to its parameter's device and memory layout, which fused Adam requires."""
     if value.shape == parameter.shape:
         return torch.empty_like(parameter).copy_(value)
     return value.to(parameter.device, copy=True)

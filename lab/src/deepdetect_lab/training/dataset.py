@@ -41,8 +41,8 @@ class FolderSource:
     """Images in files, with their labels as 1-bit PNG files.
 
     Each choice of label settings has its own subfolder of `labels`. The name of a label file holds
-    a digest of the image, so a replaced image gets a new label. Views are kept in memory up to
-    `memory_bytes` in all. Further views are rendered each time they are loaded.
+    a digest of the image, so a replaced image gets a new label. Up to `memory_bytes` of views are
+    kept in memory.
     """
 
     shard_sizes = None
@@ -95,8 +95,6 @@ class FolderSource:
     ) -> int:
         """Make the missing labels of each image's `views`, in parallel; return their number.
 
-        The rendered views are kept in memory as far as they fit into `memory_bytes`.
-
         Raises:
             BatchError: images cannot be read. The labels of all other images are made.
         """
@@ -104,9 +102,7 @@ class FolderSource:
         for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
             files = {view: self.label_path(image, view) for view in needed}
             if missing := {view: path for view, path in files.items() if not path.exists()}:
-                memory -= sum(
-                    4 * view.short_side**2 for view in missing
-                )  # a lower bound of the bytes
+                memory -= sum(4 * view.short_side**2 for view in missing)  # lower bound in bytes
                 tasks.append((index, image.path, missing, memory > 0))
         total = sum(len(missing) for _, _, missing, _ in tasks)
         failures = []
@@ -134,11 +130,7 @@ LabelTask = tuple[int, Path, dict[View, Path], bool]
 def _make_labels(
     task: LabelTask, options: LabelOptions
 ) -> tuple[LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
-    """Write the labels of an image; return the task, the rendered views, and an error message.
-
-    The views have their labels, and are returned only if the task asks for them. The message is
-    empty if the image can be read.
-    """
+    """Write the labels; return the task, the (image, label) of each view, and an error or ""."""
     _, file, labels, keep = task
     made = {}
     try:
@@ -239,8 +231,8 @@ def prepare_data(
 ) -> TrainingData:
     """List the images of a run, and make the missing labels of their views.
 
-    The arguments are those of `train`. `processes` is the number of processes that load crops. Each
-    of them keeps its own views, so they share the memory.
+    The arguments are those of `train`, and `processes`: the number of processes that load crops.
+    Each of these processes may keep views in an equal part of the memory.
     """
     images, output = Path(images), Path(output)
     folder = output / "labels" if labels is None else Path(labels)
@@ -283,14 +275,13 @@ def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
             batches = iter(loader)
             yield batches
     except DeepDetectError as error:
-        # torch raises an error of a process again, with the whole traceback as its message.
+        # torch raises the error of a process again, with the whole traceback as its message.
         text = str(error).strip()
         if not text.startswith("Caught "):
             raise
         raise type(error)(text.splitlines()[-1].partition(": ")[2]) from None
     finally:
-        # torch ends the processes when the iterator is deleted, but the traceback of an error keeps
-        # the iterator alive. Later the garbage collector would delete the queues of the processes
-        # first, and ending the processes would then take five seconds.
+        # After an error, the traceback keeps the iterator alive. The garbage collector would later
+        # delete the processes' queues first, and ending the processes would take five seconds.
         if loader.num_workers and batches is not None:
             batches._shutdown_workers()

@@ -193,11 +193,7 @@ class DenseTrainer(Trainer):
         return binary_cross_entropy_with_logits(logits, truth, pos_weight=self._pos_weight(images))
 
     def _pos_weight(self, images: Tensor) -> Tensor | None:
-        """Return the weight that the loss gives to pixels that are marked in the labels.
-
-        It has the shape (B, 1, 1, 1), one weight for each image, or (1,), one for all images. None
-        means that all weights are 1.
-        """
+        """Return the weight of marked pixels: (B, 1, 1, 1) per image, (1,) for all, None for 1."""
         normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
         if dark is None or dark == normal:  # the weight does not depend on the visibility
             return None if normal == 1 else self.to_device(torch.tensor([normal]))
@@ -241,10 +237,7 @@ class DenseTrainer(Trainer):
 
 
 def freeze_batch_norm(network: nn.Module) -> None:
-    """Make batch normalisations use running statistics instead of those of the batch.
-
-    This lasts until `network.train()` is called.
-    """
+    """Make batch normalisations use running statistics, until `network.train()` is called."""
     for module in network.modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             module.eval()

@@ -1,8 +1,7 @@
 """Training of the match filter, which separates correct and wrong matches by their neighbours.
 
-Each sample is a pair of views: usually of the same synthetic scene, sometimes of two unrelated
-scenes. Their keypoints are described by the learned descriptor or by RootSIFT, and matched. The
-scene is known, and so are the correct matches.
+A sample is a pair of views of one synthetic scene, or sometimes of two unrelated scenes. Keypoints
+are matched by learned descriptors or RootSIFT. The scene tells which matches are correct.
 """
 
 from __future__ import annotations
@@ -50,9 +49,8 @@ OF_A_MATCH, OF_TWO = 4, 11
 """Numbers of input features: `OF_A_MATCH` for a match, `OF_TWO` for a match and a neighbour."""
 
 RATIO_RANGE, RATIO_SCALE, RATIO_OFFSET = (0.05, 1.2), 3, 0.5
-"""The distance ratio of a match, as in the ratio test, is clipped to `RATIO_RANGE`. Its logarithm
-is multiplied by `RATIO_SCALE` and shifted by `RATIO_OFFSET`, so that the mean is near 0 and the
-standard deviation near 1."""
+"""The distance ratio of a match, as in the ratio test, is clipped to `RATIO_RANGE`. The feature
+`RATIO_SCALE` * log(ratio) + `RATIO_OFFSET` has mean 0 and standard deviation 1, approximately."""
 
 MEAN_COSINE = 0.7
 """Approximate mean of an input feature, the cosine of the rotation between matched keypoints. It is
@@ -63,13 +61,12 @@ LEAST_TRUST = 0.5
 number. So the result is near 0 if all weights are near 0. Chosen by hand."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
-"""The views are squares with `SIDE_PX` pixels a side, and have at most `KEYPOINTS` keypoints each.
-A pair has at least `LEAST_MATCHES` matches, one more than the number of neighbours of a match
-(`AROUND`)."""
+"""Side of the square views in pixels, their largest number of keypoints, and the least number of
+matches of a pair: one more than a match has neighbours (`AROUND`)."""
 
 UNRELATED = 7
-"""Every 7th pair shows two unrelated scenes. Pairs use the two descriptors in turn. The number is
-odd, so that unrelated pairs occur with each descriptor."""
+"""Every 7th pair shows two unrelated scenes. Pairs alternate between the two descriptors. The
+number is odd, so that unrelated pairs occur with each descriptor."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
 """A match with an error below `RIGHT_PX` is correct. A match with an error above `WRONG_PX` is
@@ -83,8 +80,8 @@ WEIGHT_DECAY = 0.01
 """Weight decay of AdamW, the default of torch."""
 
 LEFT_OUT_SHARE, FEWEST_SHARE = 0.5, 0.02
-"""Matches are left out at random in the share `LEFT_OUT_SHARE` of the pairs. At least
-`FEWEST_SHARE` of them stay: only 2 %, since the filter is meant for pairs with few matches."""
+"""Matches are left out at random in the share `LEFT_OUT_SHARE` of the pairs. At least the share
+`FEWEST_SHARE` of the matches stays: only 2 %, because the filter is for pairs with few matches."""
 
 TURNED_SHARE = 0.3
 """Share of the pairs in which both images are rotated by the same random angle. Chosen by hand."""
@@ -97,7 +94,7 @@ Sample = tuple[dict[str, np.ndarray], np.ndarray]
 
 
 class MatchFilter(nn.Module):
-    """A network that returns, for each match, the logit of the probability that it is correct."""
+    """A network that returns a logit for each match, positive if the match is likely correct."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -124,9 +121,10 @@ class MatchFilter(nn.Module):
     ) -> Tensor:
         """Return the logits (M,) of matches, positive if a match is more likely correct than wrong.
 
-        The inputs are positions (M, 2) and sizes (M,) of the matched keypoints in both images, in
-        pixels. Then come the rotations (M,) between them in radians, and the distance ratios (M,).
-        `around` (M, 2 K) holds the rows of each match's K nearest matches in each of the images.
+        `xy0`, `xy1` (M, 2) and `sizes0`, `sizes1` (M,) are positions and sizes of the matched
+        keypoints in pixels. `turns` (M,) are the rotations between them in radians, `ratios` (M,)
+        the distance ratios. `around` (M, 2 K) holds the rows of each match's K nearest matches in
+        each image.
         """
         growth, cosine, sine = (sizes1 / sizes0).log(), turns.cos(), turns.sin()
         distinct = RATIO_SCALE * ratios.clamp(*RATIO_RANGE).log() + RATIO_OFFSET
@@ -154,8 +152,7 @@ class MatchFilter(nn.Module):
         away0, away1 = (each.square().sum(2).sqrt() for each in (there0, there1))
         middle = AROUND // 2
         unit = (away0[:, middle] * away1[:, AROUND + middle]).sqrt()[:, None, None] + 1
-        # Offsets to the neighbours in the second image, as the size change and rotation of the
-        # match itself predict them from the first image.
+        # The offsets in the second image that a match's own size change and rotation predict.
         (x, y), c, s = there0.unbind(2), cosine[:, None], sine[:, None]
         expected = torch.stack([c * x - s * y, s * x + c * y], 2) * growth.exp()[:, None, None]
         lengths = [there0, there1, 2 * (there1 - there0), 2 * (there1 - expected)]
@@ -168,10 +165,7 @@ class MatchFilter(nn.Module):
 
 
 def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
-    """Draw a pair of views, match their keypoints, and return the network's inputs and the errors.
-
-    The pair depends only on the files, the seed and its number.
-    """
+    """Draw a pair of views, and match their keypoints; return the matches as a `Sample`."""
     rng = np.random.default_rng([seed, number])
     detector = PointDetector(KEYPOINTS, descriptor=(LEARNED, ROOT_SIFT)[number % 2])
 
@@ -350,8 +344,7 @@ MEASURES = ("right", "precision", "of unrelated views")
 def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]:
     """Return the loss on validation pairs, and measures of the ratio test and of the filter.
 
-    The filter is measured at two thresholds: at logit 0, and where it is as precise as the ratio
-    test.
+    The filter has two thresholds: logit 0, and one where it is as precise as the ratio test.
     """
     found, losses = {}, []
     for offset, (name, limit) in enumerate(RATIOS.items()):

@@ -17,13 +17,13 @@ PRECONDITION_FREQUENCY = 10
 """Number of steps between updates of the eigenbasis of `Soap`."""
 
 NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)
-"""Coefficients of the powers 1, 3 and 5 in a polynomial. Applied to singular values again and
-again, it moves them close to 1 (Keller Jordan, "Muon")."""
+"""Coefficients of the powers 1, 3 and 5 of a polynomial. Applied repeatedly to singular values, the
+polynomial moves them close to 1 (Keller Jordan, "Muon")."""
 
 NEWTON_SCHULZ_STEPS = 5
 MUON_RMS = 0.2
-"""Root mean square of the elements of a Muon step, in units of the learning rate. It is about as
-large as that of an Adam step (arXiv:2502.16982)."""
+"""Root mean square of the elements of a Muon step, in units of the learning rate. Adam steps are
+about as large (arXiv:2502.16982)."""
 
 MUON_WEIGHT_DECAY = 0.01
 INITIAL_POWER_ITERATIONS = 3
@@ -33,8 +33,7 @@ INITIAL_POWER_ITERATIONS = 3
 def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
     """Make the optimisers that together train a network's parameters.
 
-    The name "adam" gives Adam. "soap" gives SOAP for kernels, and Adam for biases and other
-    vectors.
+    "adam" is Adam for all parameters. "soap" is SOAP for kernels, and Adam for vectors (biases).
     """
     if name == "adam":
         return [torch.optim.Adam(network.parameters(), fused=True)]
@@ -46,9 +45,8 @@ def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
 class KernelOptimizer(Optimizer):
     """An optimiser of matrices and convolution kernels.
 
-    A kernel is treated as a matrix with one row for each output channel. The state of the optimiser
-    consists of tensors only. So safetensors can store all of it, and a resumed run is
-    bit-identical.
+    A kernel is treated as a matrix with one row for each output channel. The state consists of
+    tensors only, so that safetensors can store it, and a resumed run is bit-identical.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 1e-3) -> None:
@@ -70,9 +68,8 @@ class KernelOptimizer(Optimizer):
 class Soap(KernelOptimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 
-    The first step only computes the first eigenbasis, and does not change the parameter. The
-    package pytorch-optimizer also has SOAP. It is not used, because its state holds lists and
-    numbers, and it has a basis for each of a kernel's axes instead of two.
+    The first step only computes the first eigenbasis. The SOAP of the package pytorch-optimizer is
+    not used, because its state also holds lists and numbers.
     """
 
     def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
@@ -106,7 +103,6 @@ def _update_basis(state: dict[str, Tensor], side: str, axis: int) -> None:
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
-    """Return the initial state for a parameter, computed from its first gradient, a matrix."""
     state = {
         "step": torch.zeros(()),
         "exp_avg": torch.zeros_like(gradient),
@@ -118,8 +114,7 @@ def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
         basis = torch.eye(len(state[side]), device=gradient.device)
         for _ in range(INITIAL_POWER_ITERATIONS):
             basis = torch.linalg.qr(state[side] @ basis)[0]
-        # A basis from a checkpoint is contiguous. This one is made contiguous as well, because the
-        # rounding in products depends on the layout.
+        # The basis is made contiguous, as in a checkpoint, because rounding depends on the layout.
         state[f"{side}_basis"] = basis.contiguous()
     return state
 

@@ -25,8 +25,7 @@ class Stage:
         crop: side of the square crops in pixels, a multiple of 8.
         batch: number of crops per batch.
         epochs: number of times that each image is used.
-        sides: shorter sides of the views from which crops are taken. Empty: all views that are
-            large enough.
+        sides: crop only views with these shorter sides. Empty: all views that are large enough.
     """
 
     crop: int
@@ -74,23 +73,19 @@ class TrainingOptions:
 
     Attributes:
         network: name of the network: "fast" or "espnet".
-        stages: stages of the training in order. A crop should be as large as its view, because
-            Harris and Sobel labels are relative to the largest response in the whole image, and
-            `fast` uses statistics of the whole image. Smaller crops make steps cheaper.
-        interleave: mix the steps of all stages evenly, so that crops of every size are used until
-            the end.
+        stages: stages of the training in order. Crops should be whole views, because Harris and
+            Sobel labels and the network `fast` depend on the whole image. Smaller crops are
+            cheaper.
+        interleave: mix the steps of all stages evenly, so that all crop sizes are used to the end.
         short_sides: sizes in pixels to which the shorter side of each image is scaled, one view for
-            each size. Crops are taken from all views that are large enough for the stage. The first
-            size is used for validation.
+            each size. The first size is used for validation.
         square: make images square: "crop" takes the central square, "squash" resizes without
             keeping the aspect ratio, as in the paper. None: keep the aspect ratio.
         max_images: use at most this many images, including those for validation.
-        val_fraction: fraction of the images held out for validation, if there is no folder of
-            validation images.
+        val_fraction: fraction of the images held out for validation, if no folder is given for it.
         dark_fraction: fraction of darkened crops (paper: a quarter).
-        augmentations: number of augmented views of each image (rotated, relit, blurred, noisy or
-            compressed), in normal light and again in dark light. Their size is the first of
-            `short_sides`. Each is used as often as the original view of a size.
+        augmentations: number of augmented views (rotated, relit, blurred, noisy or compressed) of
+            each image, in normal and again in dark light. Their size is the first of `short_sides`.
         transpositions: mirror half of the crops along their diagonal. Only BRISK would label a
             mirrored crop differently. Flips would also change labels of Shi-Tomasi, SIFT and ORB.
         color_jitter: fraction of the crops whose colours are removed or rotated. The luma, on which
@@ -98,23 +93,18 @@ class TrainingOptions:
         optimizer: "adam", or "soap", which learns more per image (measurements: lab/HISTORY.md).
         learning_rate: learning rate at the start of cosine annealing, which ends at 1e-6.
         warm_up: fraction of the steps over which the learning rate rises from zero. It protects
-            trained initial weights: in the first steps, Adam has seen too few gradients to choose
-            good step sizes, and would undo much of the earlier training.
+            trained initial weights, which the inaccurate first steps of Adam would spoil.
         average_decay: decay per step of the exponential average of the weights; the average is
             validated and saved, and with 0 it equals the weights.
         max_gradient_norm: gradients with a larger norm are scaled down to it; None: no limit.
-        frozen_batch_norm: normalise by the batch statistics stored with the initial weights,
-            because the statistics of small batches vary much. None: only if the initial weights are
-            trained.
-        pos_weight: weight in the loss of pixels that are marked in the label. With 1, the network
-            marks too few pixels where it is uncertain, since most pixels are not marked. Above 1,
-            more pixels reach a probability of 0.5.
-        low_light_pos_weight: weight of marked pixels in crops of low visibility. None: as in all
-            other crops.
+        frozen_batch_norm: normalise by the statistics stored with the initial weights, because
+            small batches have unreliable ones. None: only if the initial weights are trained.
+        pos_weight: weight in the loss of pixels that are marked in the label. With 1, an uncertain
+            network marks too few pixels, because most are not marked. Above 1, it marks more.
+        low_light_pos_weight: `pos_weight` in crops of low visibility. None: as in all other crops.
         labels: the label detectors and their settings.
         val_count: number of validations.
-        seed: seed of the initial weights, the order of the images, the crops and their
-            augmentation.
+        seed: seed of the initial weights, the image order, the crops and their augmentation.
 
     Raises:
         OptionError: a value is out of its range.
@@ -195,8 +185,7 @@ class DeviceOptions:
 
     Attributes:
         device: "auto" (CUDA if there is a GPU, else the CPU), "cpu" or "cuda".
-        precision: "float32", "bfloat16", or "auto", which is bfloat16 if the CPU or GPU computes
-            with it, else float32.
+        precision: "float32", "bfloat16" or "auto": bfloat16 if the hardware computes with it.
         compile: use torch.compile; by default on a GPU, or if there is a C++ compiler.
         threads: number of CPU threads of torch; by default torch's choice.
         num_workers: number of processes that load and augment crops; with 0, the training process
@@ -242,7 +231,7 @@ class PointsTrainingOptions:
         side: side of the square views, in pixels.
         learning_rate: highest learning rate; cosine annealing ends at 2 % of it.
         min_density, max_density: smallest and largest number of keypoints per pixel that the ranker
-            learns to choose. Each pair gets a number in between, log-uniformly distributed.
+            learns to choose. The number for a pair is drawn log-uniformly between them.
         val_count: number of validations, besides one before the first step.
         val_pairs: number of validation pairs of each kind: zoom, blur, viewpoint, light.
         seed: seed of the weights and the pairs.
@@ -284,8 +273,7 @@ class DescriptorTrainingOptions:
         learning_rate: highest learning rate (of Muon), after the warm-up; it falls linearly to 0.
         val_count: number of validations.
         val_pairs: number of validation pairs of each kind: upright, rotated, zoomed.
-        cross_modal: simulate that the two views of a pair come from different sensors: with other
-            mixtures of colour channels, with inverted or otherwise changed tones, or as edges.
+        cross_modal: imitate two different sensors by mixed colour channels, changed tones or edges.
         seed: seed of the weights and the pairs.
 
     Raises:
@@ -318,8 +306,7 @@ class MatchFilterTrainingOptions:
     Attributes:
         steps: optimiser steps.
         pairs: pairs of views in each step, each varied at random.
-        drawn: number of pairs of views that are drawn before the first step. Each step takes its
-            pairs from these.
+        drawn: number of pairs drawn before the first step. Each step takes its pairs from these.
         learning_rate: highest learning rate, after the warm-up; it falls linearly to 0.
         val_count: number of validations.
         val_pairs: number of validation pairs.
@@ -366,8 +353,7 @@ _ESPNET = TrainingOptions(
 PRESETS: dict[str, TrainingOptions] = {
     # Crops are whole views of several sizes, in normal and dark light. Weights are averaged.
     "default": TrainingOptions(),
-    # Small crops come first, large ones later. The views have several sizes, and keep the aspect
-    # ratio of the images.
+    # Small crops come first. The views have several sizes, and keep the images' aspect ratio.
     "espnet": _ESPNET,
     # The paper's recipe (Section III-B): about 33,000 images to train on and 8,000 for validation,
     # all squashed to 480x480. A quarter of the crops are darkened. 100 epochs in batches of 64.
@@ -383,7 +369,7 @@ PRESETS: dict[str, TrainingOptions] = {
         val_count=20,
     ),
     # For two-view geometry, like the paper's second weights (Figure 8): labels mark more pixels,
-    # and all views are in normal light. It is meant to start from trained weights.
+    # and all views are in normal light. The recipe is meant to start from trained weights.
     "dense": TrainingOptions(
         dark_fraction=0.0, labels=LABEL_SETTINGS["dense"], learning_rate=1.5e-3
     ),

@@ -56,16 +56,13 @@ def train(
         output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx,
             MODEL_CARD.md and the loss curves.
         options: the recipe.
-        validation: folder of other images for the validation. None: some of the images are held
-            out.
+        validation: folder of other images for validation. None: some of `images` are held out.
         labels: folder in which labels are cached. None: a folder in `output`.
-        init_weights: weights to start from: .safetensors files, or the bundled weights "default",
-            "dense", "free" or "espnet"; several weights are averaged. None: random weights by the
-            seed.
+        init_weights: .safetensors files or bundled weights ("default", "dense", "free", "espnet")
+            to start from; several are averaged. None: random weights by the seed.
         device: device, precision, compilation and processes.
         workers: number of processes that make labels. None: one per processor.
-        log: function that is called with each line of text for the user. None: there is no text,
-            and there are no progress bars.
+        log: function that gets each line of text for the user. None: no text, and no progress bars.
 
     Returns:
         The weights' files and the loss curves.
@@ -115,11 +112,10 @@ def train_on_pairs(
         init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file.
             None: random weights by the seed.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
-        num_workers: number of processes that generate pairs; with 0, the training process does it
-            itself. None: 0, or one less than the number of processors for a descriptor on a GPU. A
-            match filter ignores this: it draws its pairs before training, on all processors.
-        log: function that is called with each line of text for the user. None: there is no text,
-            and there are no progress bars.
+        num_workers: number of processes that generate pairs; with 0, the training process does it.
+            None: 0, or for a descriptor on a GPU, one less than the number of processors. A match
+            filter always uses all processors.
+        log: function that gets each line of text for the user. None: no text, and no progress bars.
 
     Returns:
         The files of the weights, and the training curves. `PointDetector` reads the weights of
@@ -172,16 +168,11 @@ def _dense_trainer(
     log: Log | None = None,
     **data: Any,
 ) -> DenseTrainer:
-    """Make the missing labels, and return the trainer of the detector network.
-
-    `data` holds the arguments `validation`, `labels` and `workers` of `train`.
-    """
+    """Make missing labels; return the trainer. `data` holds the further arguments of `train`."""
     from .dataset import prepare_data
     from .dense import DenseTrainer, initial_network
 
-    options, network = initial_network(
-        options, init_weights
-    )  # comes first, so that its errors are raised before labels are made
+    options, network = initial_network(options, init_weights)  # may raise, so it comes first
     loading = max(1, device.worker_count)
     prepared = prepare_data(images, options, output, **data, processes=loading, quiet=log is None)
     return DenseTrainer(network, options, prepared, device)

@@ -1,7 +1,4 @@
-"""The steps of a run and their batches, which depend only on the seed and the step.
-
-So a resumed run gets exactly the same batches as an uninterrupted run.
-"""
+"""The steps of a run and their batches, which are the same after an interruption."""
 
 from __future__ import annotations
 
@@ -19,8 +16,7 @@ FINAL_LEARNING_RATE = 1e-6
 """Cosine annealing of the learning rate ends at this value (paper, Section III-B)."""
 
 SHUFFLED_SHARDS = 4
-"""Number of shards that are read at a time. Their images are shuffled together. Chosen by hand; not
-measured."""
+"""Number of shards that are read at a time and shuffled together. Chosen by hand; not measured."""
 
 
 class CropIndex(NamedTuple):
@@ -33,11 +29,7 @@ class CropIndex(NamedTuple):
 
 
 class Position(NamedTuple):
-    """Position of a step in its stage.
-
-    `sample` is the number of the step's first crop, counted from the start of the stage.
-    `first_epoch` is the number of the first epoch of the stage.
-    """
+    """A step's stage, the number of its first crop in the stage, and the stage's first epoch."""
 
     stage: Stage
     sample: int
@@ -95,8 +87,7 @@ class CropSampler(Sampler[list[CropIndex]]):
         schedule: the steps.
         shard_sizes: number of images in each shard, so that the crops of only a few shards are
             mixed at a time. None: the images are not in shards, and are all mixed.
-        first_step, last_step: the batches go from the first step to the step before the last; by
-            default over all steps.
+        first_step, last_step: the steps are `first_step` to `last_step` - 1; by default all steps.
 
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)

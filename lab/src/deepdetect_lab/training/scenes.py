@@ -1,9 +1,8 @@
 """Synthetic scenes: layers of photographs in two views, with known correspondences.
 
 Both views are warped (zoom, rotation, tilt, perspective), the second one often also by a smooth
-relief. Parts of photographs may lie in front, each with a small motion of its own. So networks
-learn to cope with parallax and occlusion without pairs of real photographs. The learned descriptor
-and the match filter are trained on these scenes.
+relief. Parts of photographs may lie in front, each with a small motion of its own. So the learned
+descriptor and the match filter learn parallax and occlusion without real pairs of photographs.
 """
 
 from __future__ import annotations
@@ -37,16 +36,14 @@ SIDE_PX = 256
 """Default side of the square views, for which `PERSPECTIVE` is given. Chosen by hand."""
 
 MARGIN_PX = 6
-"""Keypoints within this distance of a view's border are not used, because part of their
-surroundings is cut off."""
+"""Keypoints closer than this to a view's border are not used: their surroundings are cut off."""
 
 OFFSET_PX = 90.0
 """The centre of the first view is up to 90 pixels from the photograph's centre along each axis. So
 every part of a photograph with sides of 480 pixels is seen by some views."""
 
 SCALE = Effect(1, math.log(0.6), math.log(1.5))
-"""Range of the logarithm of the first view's scale, in pixels of the photograph per pixel of the
-view. Chosen by hand."""
+"""Range of the first view's log scale (photograph pixels per view pixel). Chosen by hand."""
 
 SCALE_LIMITS = (0.42, 1.8)
 """The scales of both views, in pixels of the photograph per pixel of the view, are brought into
@@ -60,10 +57,9 @@ effects happen, the last one counts. `FAR_ZOOM` enlarges or reduces, with equal 
 used because a descriptor that was trained on less zoom was worse on zoomed images."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
-"""The first numbers are for the rotation of the first view, the second numbers for the rotation
-from the first to the second view. `ROTATED_SHARES` are the shares of rotations by any angle. All
-other angles are normally distributed with the standard deviations `UPRIGHT_DEVIATIONS`, in radians
-(about 8 degrees, like hand-held cameras)."""
+"""The first number of each pair is for the rotation of the first view, the second for the rotation
+between the views. `ROTATED_SHARES` are the shares of rotations by any angle. All other angles have
+the standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees)."""
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
 """The tilt of a view is the ratio of its scales along two axes. In the share `NORMAL_TILT` of the
@@ -72,14 +68,13 @@ all other second views, the logarithm is uniform up to the tilt `LARGEST_TILT`, 
 seen at 66 degrees. Beyond it, little of the plane can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
-"""The tilt in a first view exceeds 1, no tilt, by at most these values. `FIRST_TILT` is for the
-scene, `FRONT_TILT` for the parts in front."""
+"""`FIRST_TILT` is for the scene, `FRONT_TILT` for the parts in front. The tilt in first views
+exceeds 1, which means no tilt, by at most these values."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
-"""`PERSPECTIVE` is the standard deviation of both perspective coefficients of a homography, per
-pixel of a view with `SIDE_PX` pixels a side. A coefficient of this size changes the scale by 11 %
-from the middle to a border. In first views, the coefficients are multiplied by
-`FIRST_PERSPECTIVE`."""
+"""Standard deviation of both perspective coefficients of a homography, per pixel of a view with
+`SIDE_PX` pixels a side. Such a coefficient changes the scale by 11 % from the middle to a border.
+In first views, the coefficients are multiplied by `FIRST_PERSPECTIVE`."""
 
 SHIFT_DEVIATION = 18.0
 """Standard deviation of the second view's shift, in pixels of the first view. Chosen by hand."""
@@ -98,19 +93,16 @@ FRONT_SHARE, FRONT_COUNTS, OTHER_PHOTOGRAPH_SHARE = 0.5, (1, 1, 2, 3), 0.8
 from `FRONT_COUNTS`. The share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs."""
 
 SHAPE_PX, UNCOVERED = 480, (0.6, 0.88)
-"""A part in front is cut from a photograph where smooth noise, drawn with `SHAPE_PX` pixels a side,
-is above a quantile. The quantile is drawn from `UNCOVERED`. So parts are blobs of any shape that
-hold 12 to 40 % of their photograph."""
+"""A part in front is cut from a photograph where smooth noise (`SHAPE_PX` pixels a side) is above a
+quantile from `UNCOVERED`. So parts are blobs that hold 12 to 40 % of their photograph."""
 
 FRONT_OFFSET_PX, FRONT_SCALE, FRONT_ANGLE = 60.0, 0.2, 0.3
-"""These numbers say how far the pose of a part in front may be from that of the scene, in the first
-view. `FRONT_OFFSET_PX` is the largest offset along each axis, in pixels of the photograph. The
-others are standard deviations: of the logarithm of the scale, and of the angle in radians."""
+"""Pose of a part in front relative to the scene's pose, in the first view: largest offset along an
+axis in photograph pixels, and standard deviations of the log scale and of the angle in radians."""
 
 MOTION_SHIFT, MOTION_SCALE, MOTION_ANGLE, MOTION_TILT = 22.0, 0.12, 0.06, 0.15
-"""These are standard deviations of the motion of a part in front relative to the scene, from the
-first to the second view. `MOTION_SHIFT` is in pixels of the first view, `MOTION_ANGLE` in radians.
-`MOTION_SCALE` and `MOTION_TILT` are for the logarithms of the scale and of the tilt."""
+"""Standard deviations of the motion of a part in front, relative to the scene, between the views:
+shift in pixels of the first view, log scale, angle in radians, and log tilt."""
 
 ALIASED_SCALE, PIXEL_SIGMA = 1.15, 0.5
 """A photograph that is reduced by a factor above `ALIASED_SCALE` is blurred before it is sampled,
@@ -137,8 +129,7 @@ at 99 % of the positions, and at most 0.5 pixels elsewhere."""
 class View:
     """The map from a view to a photograph: a displacement by the relief, then a homography.
 
-    The relief holds a displacement in pixels, (S, S, 2), for each pixel of the view. None: there is
-    no displacement.
+    `relief` holds the displacement (S, S, 2) of each pixel, in pixels. None: no displacement.
     """
 
     matrix: np.ndarray
@@ -198,10 +189,7 @@ class Pose:
     def draw_matrix(
         self, rng: np.random.Generator, side_px: int, perspective: float = 1
     ) -> np.ndarray:
-        """Draw the homography from the view to the photograph.
-
-        The direction of the tilt and the perspective are random.
-        """
+        """Draw the homography from view to photograph with a random perspective and tilt axis."""
         azimuth, root = rng.uniform(0, math.pi), math.sqrt(self.tilt)
         linear = rotation(self.angle) @ scaled_along(azimuth, root, 1 / root) * self.scale
         bend = perspective * SIDE_PX / side_px * rng.normal(0, PERSPECTIVE, 2)
@@ -251,7 +239,6 @@ def _draw_photograph(rng: np.random.Generator, files: Sequence[Path]) -> np.ndar
 
 
 def _draw_scales(rng: np.random.Generator) -> list[float]:
-    """Draw the scale of each view, in pixels of the photograph per pixel of the view."""
     scale, zoom = math.exp(SCALE.strength(rng)), 1.0
     for effect in ZOOMS:
         if effect.happens(rng):

@@ -50,10 +50,7 @@ Files = tuple[tuple[Path, int], ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """A folder of shards: the path of each shard, with its number of images.
-
-    The name of a shard holds a digest of its content.
-    """
+    """A folder of shards: path and number of images of each. File names hold a content digest."""
 
     folder: Path
     training: Files
@@ -137,8 +134,7 @@ def write_shards(
     Args:
         images: folder of images.
         output: folder for the shards, other than the folder of the images.
-        options: the recipe for training on the shards. It determines the validation images, and the
-            views and labels of all images.
+        options: the recipe, which determines the validation images, and all views and labels.
         shard_size: approximate number of images per shard.
         workers: number of processes; default one per processor.
         quiet: show no progress bar.
@@ -206,10 +202,7 @@ ShardTask = tuple[Path, Sequence[tuple[str, SourceImage, Sequence[View]]]]
 def _deal(
     images: Sequence[SourceImage], root: Path, shard_size: int
 ) -> list[list[tuple[str, SourceImage]]]:
-    """Assign images to shards by hashes of their names, so that a new image changes few shards.
-
-    Returns the (name, image) pairs of each shard.
-    """
+    """Assign images to shards by hashes of their names, so that a new image changes few shards."""
     shards: list[list[tuple[str, SourceImage]]] = [[] for _ in range(-(-len(images) // shard_size))]
     for image in images:
         name = image.path.relative_to(root).as_posix()
@@ -252,7 +245,7 @@ def _files_of(
 
 @functools.lru_cache(maxsize=64)
 def _read_members(path: Path) -> list[tuple[str, dict[str, tuple[int, int]]]]:
-    """List the images of a shard: for each its key, and offset and size in bytes of its files."""
+    """List a shard's images: the key of each, and the offset and size in bytes of its files."""
     samples: dict[str, dict[str, tuple[int, int]]] = {}
     try:
         with tarfile.open(path, "r:") as tar:

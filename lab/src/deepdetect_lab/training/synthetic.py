@@ -1,7 +1,6 @@
 """Operations for synthetic views: homographies, and changes of light, blur, noise and JPEG.
 
-Each kind of training sets how often and how strongly these operations are applied, by a `Light` and
-a `Camera`, which consist of `Effect`s.
+A `Light` and a `Camera`, made of `Effect`s, set how often and how strongly each is applied.
 """
 
 from __future__ import annotations
@@ -43,9 +42,9 @@ CURVE_TONES = 6
 """A tone curve rises from black to white through 6 random grey levels."""
 
 DARK_NOISE_LEVELS, DARK_NOISE_LIGHT = (0.2, 0.6, 3.0), 0.25
-"""The standard deviation of the noise in dark views, in grey levels, is drawn from a range that
-begins at 0.2. Its end grows from 0.6 without light to 3.0 at the fraction `DARK_NOISE_LIGHT` of the
-light, because shot noise grows with the number of photons."""
+"""The sigma of the noise in dark views is drawn between 0.2 grey levels and a maximum. The maximum
+grows from 0.6 without light to 3.0 at the fraction `DARK_NOISE_LIGHT` of the light, because shot
+noise grows with the number of photons."""
 
 
 def happens(rng: np.random.Generator, share: float) -> bool:
@@ -93,8 +92,8 @@ class Light:
         curve: share of the views that get a random increasing tone curve.
         contrast: a change of contrast around `MIDDLE_GREY`. The strength is its factor.
         log_gain: a factor on all values. The strength is its natural logarithm.
-        ramp: a linear increase of light across the view. The strength is the fraction by which it
-            differs between opposite borders.
+        ramp: a linear increase of light across the view. The strength is the fraction by which the
+            light differs between opposite borders.
         shift: range of an offset. It is added only if the contrast or the gain is changed.
     """
 
@@ -115,8 +114,7 @@ class Camera:
 
     Attributes:
         blur: Gaussian blur. The strength is its sigma in pixels.
-        motion: motion blur of views that get no Gaussian blur. The strength is its length, in whole
-            pixels.
+        motion: motion blur, if there is no Gaussian blur. The strength is its length in pixels.
         log_dark: darkening, with the noise of dark views. The strength is the natural logarithm of
             the fraction of the light that is left.
         noise: noise of views that are not darkened. The strength is its sigma in grey levels. Only
@@ -134,7 +132,7 @@ class Camera:
 def relight(rng: np.random.Generator, view: np.ndarray, light: Light) -> np.ndarray:
     """Change the light of a view, (S, S) with values in [0, 1].
 
-    If `light` has no `field`, `shadow` and `ramp`, the view can have any shape.
+    If `light` has no `field`, `shadow` or `ramp`, the view can have any shape.
     """
     if not happens(rng, light.share):
         return view
@@ -226,9 +224,9 @@ def rotation(angle: float) -> np.ndarray:
 
 
 def scaled_along(azimuth: float, along: float, across: float) -> np.ndarray:
-    """Return the matrix (2, 2) that scales by `along` in a direction, by `across` perpendicularly.
+    """Return the (2, 2) matrix that scales by `along` in a direction, by `across` at right angles.
 
-    The direction `azimuth` is in radians.
+    `azimuth` is the angle of the direction in radians.
     """
     return rotation(azimuth) @ np.diag([along, across]) @ rotation(-azimuth)
 

@@ -61,8 +61,7 @@ class TrainingResult:
         onnx: ONNX file with the same weights; None for a ranker.
         points: points of the training curves: losses and measures by name, for each validation.
         best: the point of the best weights.
-        images_per_second: mean speed of the training, counted in images of 480x480 pixels; 0 if it
-            is on pairs of views.
+        images_per_second: mean speed, in images of 480x480 pixels; 0 for training on pairs.
     """
 
     weights: Path
@@ -114,7 +113,7 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches for steps `first` to `last` - 1; None: to the end."""
+        """Return a loader of the batches for steps `first` to `last` - 1 (None: to the end)."""
 
     def pixels(self, batch: Any) -> int:
         """Return the number of pixels in a batch, from which the speed is computed; 0: no speed."""
@@ -249,7 +248,7 @@ class Trainer(abc.ABC):
         state = TrainingState(**{name: metadata[name] for name in names})
         restore(tensors, self.network, self.average, self.optimizers)
         if state.points:
-            self.read_notes(folder / self.weights_file)  # if the file is missing, fail now
+            self.read_notes(folder / self.weights_file)  # fails now if the file is missing
         return state
 
     def _inputs(self) -> dict[str, Any]:

@@ -25,9 +25,9 @@ from .recipe import TrainingOptions
 class View:
     """A view of an image for the network: shorter side in pixels, light and shape.
 
-    `square` is None if it shows the whole image, "crop" for the central square, and "squash" for
-    the image resized to a square. If `augmentation` is given, the view instead shows a square part
-    with random augmentations, of which this is the seed.
+    `square` is None if the view shows the whole image, "crop" for the central square, and "squash"
+    for the image resized to a square. If `augmentation`, a seed, is given, the view instead shows a
+    square part of the image with random augmentations.
     """
 
     short_side: int
@@ -108,7 +108,7 @@ def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray
 
 
 def label_key(options: LabelOptions) -> str:
-    """Return a digest of the label settings. A label depends on these, the image and the view."""
+    """Return a digest of the label settings, which determine a label together with the view."""
     names = options.detectors
     return key({n: [options.parameters(n, "normal"), options.parameters(n, "low")] for n in names})
 
@@ -118,7 +118,7 @@ def list_images(
 ) -> list[SourceImage]:
     """List the images in a folder, recursively.
 
-    If there are more than `limit`, checksums of their file names decide which ones are used.
+    If there are more than `limit` images, checksums of the file names decide which are used.
     """
     paths = find_images(root, exclude)
     if limit is not None and len(paths) > limit:
@@ -137,14 +137,13 @@ def train_val_split(
 ) -> tuple[list[SourceImage], list[SourceImage]]:
     """Split images into training images and about the given fraction of validation images.
 
-    A checksum of its file name decides for each image, so that the image stays in its part when
-    other images are added.
+    The checksum of an image's file name decides, so that the image stays in its part when other
+    images are added.
     """
     training: list[SourceImage] = []
     validation: list[SourceImage] = []
     for image in images:
-        # `list_images` selects images by the same checksum. With reversed bits, the split is
-        # independent of that selection.
+        # Reversed bits make the split independent of `list_images`, which uses the same checksum.
         draw = int(f"{zlib.crc32(image.path.name.encode()):032b}"[::-1], 2) / 2**32
         (validation if draw < val_fraction else training).append(image)
     if not validation:

@@ -19,9 +19,8 @@ loss. A match is correct in the metric if it lies within this distance of the tr
 
 MAX_LOG_TEMPERATURE = 4.3
 UPRIGHT, ANGLE_NOISE = 0.45, 0.15
-"""Pairs of views that are rotated against each other by less than `UPRIGHT` radians count as
-upright. `ANGLE_NOISE` is the standard deviation, in radians, of the simulated errors of keypoint
-angles. Both are chosen by hand and not measured."""
+"""Pairs of views with a rotation below `UPRIGHT` radians count as upright. `ANGLE_NOISE` is the
+standard deviation, in radians, of simulated errors of keypoint angles. Both are chosen by hand."""
 
 KINDS = ("upright", "turned", "zoomed")
 
@@ -34,7 +33,7 @@ def kind_of(angle: float, zoom: float) -> str:
 
 
 def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
-    """Describe the keypoints of both views, without undoing any rotation; (B, N, 64) each."""
+    """Return descriptors (B, N, 64) of the keypoints of each view, without undoing any rotation."""
     images = batch.images.transpose(0, 1).flatten(0, 1)[:, None].float() / 255
     with torch.autocast(images.device.type, torch.bfloat16):
         maps = network.maps(images.contiguous(memory_format=torch.channels_last))
@@ -44,7 +43,7 @@ def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Ten
 
 
 def mirror(batch: Pair, which: Tensor) -> Pair:
-    """Mirror those pairs of a batch left to right that are marked in `which`, (B,) bool."""
+    """Mirror left to right the pairs of a batch that are marked in `which`, (B,) bool."""
 
     def mirrored(xy: Tensor) -> Tensor:
         x, y = xy.unbind(-1)
@@ -64,10 +63,9 @@ def contrastive_loss(
     """Return the symmetric InfoNCE loss, the cross-entropy of the true match among all keypoints.
 
     Half of the pairs are mirrored. The descriptors of the second view are rotated back by `counted`
-    (see `angles_counted`) times the rotation between the views at each keypoint. To imitate a
-    detector, this angle has random errors. If a pair is rotated by less than `UPRIGHT`, its
-    descriptors are not rotated back in half of the cases, because in use those of upright images
-    are not rotated either.
+    (see `angles_counted`) times the rotation between the views at each keypoint, with random errors
+    like those of a detector. Half of the pairs that are rotated by less than `UPRIGHT` are not
+    rotated back, because in use upright images are described without rotation.
     """
     device, count = batch.turns.device, len(batch.turn)
     mirrored, kept = torch.from_numpy(generator.random((2, count)) < 0.5).to(device)

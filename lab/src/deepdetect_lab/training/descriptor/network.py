@@ -1,10 +1,10 @@
 """The network of the learned descriptor: feature maps of the whole image, sampled at keypoints.
 
-`DescriptorNetwork.maps` computes feature maps at 1/2 to 1/16 of the image size. The same kernels
-are applied to three octaves: the image, and the image reduced to 1/2 and 1/4. `describe` samples
-the maps of the first octave and of the octave that fits the keypoint's size. A perceptron maps the
-samples to a descriptor of 64 numbers. The first 16 numbers do not change when the image is rotated.
-The other 48 rotate with the image (`deepdetect.features.learned`).
+`DescriptorNetwork.maps` computes feature maps at 1/2 to 1/16 of the image size, with the same
+kernels for three octaves: the image, and the image reduced to 1/2 and 1/4. `describe` samples the
+maps of the first octave and of the octave that fits the keypoint's size. A perceptron maps the
+samples to 64 numbers: 16 that do not change when the image is rotated, and 48 that rotate with the
+image (`deepdetect.features.learned`).
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ of feature maps, from 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`)."""
 DIMENSIONS = CONSTANT + 2 * len(FREQUENCIES)
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
-"""Keypoints up to this size are described by feature maps of the full image. Larger keypoints also
-need those of the image reduced to 1/2 or 1/4, which are interpolated between octaves."""
+"""A keypoint up to this size is described by feature maps of the full image only. For a larger
+keypoint, the maps of the two octaves nearest to its size are interpolated and used as well."""
 
 SMALLEST_SIZE_PX = 2.5
 NOISE = 1 / 255
@@ -35,7 +35,7 @@ NOISE = 1 / 255
 normalisation by local contrast does not amplify them to full contrast."""
 
 CELL_PX, CELLS = 8, 5
-"""Local contrast is that of a square of 5x5 cells of 8x8 pixels. Chosen by hand; not measured."""
+"""Local contrast is computed in a square of 5x5 cells of 8x8 pixels. Chosen by hand."""
 
 BATCH_MOMENTUM = 0.1
 
@@ -183,8 +183,7 @@ def _doubled(features: Tensor) -> Tensor:
 def _read(features: Tensor, xy: Tensor) -> Tensor:
     """Sample feature maps (B, C, H, W) bilinearly at positions (B, N, 2); return (B, N, C).
 
-    Positions outside a map are clamped to its border. All channels of a pixel are gathered at once.
-    On a CPU this is twenty times as fast as `grid_sample`, which reads each channel separately.
+    Positions are clamped to the map. On a CPU this is twenty times as fast as `grid_sample`.
     """
     shape = torch._shape_as_tensor(features)
     last = shape[[3, 2]].to(xy.dtype) - 1

@@ -29,7 +29,7 @@ ONNX = "descriptor.onnx"
 
 REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
 """Each pair is used in `REUSE` steps on average, because drawing a pair takes longer than training
-on it. A step chooses from the last `WINDOW` pairs, the first step from `FIRST_BATCHES` batches."""
+on it. Steps choose from the last `WINDOW` pairs, at first from `FIRST_BATCHES` batches of pairs."""
 
 WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
 """The learning rate rises over `WARM_UP_STEPS` steps, but at most over the share `WARM_UP_SHARE` of
@@ -155,7 +155,7 @@ class DescriptorTrainer(Trainer):
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
 
-        The pairs are those that no earlier step has used, or None if there are none.
+        `pairs` are those that no earlier step has used, or None; `numbers` are their numbers.
         """
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(

@@ -1,7 +1,6 @@
 """Draw training pairs: two views of a synthetic scene, and the keypoints visible in both.
 
-Each view has its own light, blur, noise and JPEG compression. So the descriptor learns to cope with
-parallax, occlusion and darkness without pairs of real photographs.
+Each view has its own light, blur, noise and JPEG compression.
 """
 
 from __future__ import annotations
@@ -32,16 +31,16 @@ from ..synthetic import (
 )
 
 KEYPOINTS = 256
-"""A pair has at most this many keypoints, because the loss compares each keypoint of one view with
-all of the other. They are enough to fill a view."""
+"""A pair has at most this many keypoints, because the loss compares all keypoints of one view with
+all keypoints of the other view. This number is enough to fill a view."""
 
 LEAST_KEYPOINTS, LEAST_IF_ZOOMED, ZOOMED = 64, 40, 0.8
 """Pairs whose views share fewer than `LEAST_KEYPOINTS` keypoints are drawn again. If the absolute
 logarithm of the zoom between the views is above `ZOOMED`, the limit is `LEAST_IF_ZOOMED`."""
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
-"""Only the `STRONGEST` best candidates of the first view are used. Their sigma is below
-`MAX_FIRST_SIGMA_PX`, because the areas around larger ones do not fit into a view of 256 pixels."""
+"""Candidates of the first view are used if their sigma is below `MAX_FIRST_SIGMA_PX`, but at most
+the `STRONGEST` best. Areas around larger candidates do not fit into a view of 256 pixels."""
 
 SIGMA_RANGE_PX = (1.0, 13.0)
 """Keypoints are left out if their sigma in the second view is not in this range. Smaller keypoints
@@ -57,22 +56,18 @@ changed, to simulate a repeatable detector. `RANDOM_SHARE` is the share of the p
 random keypoints instead of the strongest."""
 
 JITTER_PX = 0.5
-"""Keypoints in the first view are moved at random by up to half a pixel along each axis. This
-simulates positions that are rounded to whole pixels."""
+"""Keypoints in the first view are moved at random by up to half a pixel, as rounding would do."""
 
 SIZE_ERRORS, SMALL_ERROR_SHARE = (0.12, 0.4), 0.6
-"""Keypoint sizes in the second view get random errors, as those of detectors have. The standard
-deviation of the logarithm of the size is the first of `SIZE_ERRORS` for the share
-`SMALL_ERROR_SHARE` of the keypoints, and the second for the rest."""
+"""Keypoint sizes in the second view get random errors. The standard deviation of the log size is
+the first of `SIZE_ERRORS` for `SMALL_ERROR_SHARE` of the keypoints, and the second for the rest."""
 
 PLACE_ERROR_PX, PLACE_ERROR_PER_SIGMA, PLACE_ERROR_SIGMA = 0.225, 0.162, 6.0
 """Keypoint positions in the second view get random errors. Their standard deviation in pixels is
-`PLACE_ERROR_PX` plus `PLACE_ERROR_PER_SIGMA` times the keypoint's sigma. A sigma above
-`PLACE_ERROR_SIGMA` counts as `PLACE_ERROR_SIGMA`."""
+`PLACE_ERROR_PX` + `PLACE_ERROR_PER_SIGMA` * min(`PLACE_ERROR_SIGMA`, sigma of the keypoint)."""
 
 UNCHANGED_SHARE = 0.15
-"""Share of the views that get no change of light, blur, noise or compression. Chosen by hand; not
-measured."""
+"""Share of the views without changes of light, blur, noise or compression. Chosen by hand."""
 
 LIGHT = Light(
     field=Effect(0.25, 0, 0.7, power=0.5),
@@ -93,15 +88,13 @@ CAMERA = Camera(
 values that occur in use. How much each of the ranges contributes was not measured."""
 
 CROSS_MODAL_SHARE, MIXED_SHARE = 0.6, 0.45
-"""Pairs for the cross-modal descriptor imitate two sensors. The share `CROSS_MODAL_SHARE` of these
-pairs has changed tones in one view (`change_tones`). The share `MIXED_SHARE` has one view that
-shows a random mixture of the colour channels (`draw_mixture`). A pair may have both changes."""
+"""`CROSS_MODAL_SHARE` of the cross-modal pairs have changed tones in one view (`change_tones`).
+`MIXED_SHARE` have mixed colour channels in one view (`draw_mixture`). A pair may have both."""
 
 ONE_COLOUR_SHARE, MIXTURE_DEVIATION, LEAST_WEIGHT = 0.4, 0.6, 0.5
-"""A mixture is a single colour channel with the probability `ONE_COLOUR_SHARE`. Otherwise the three
-weights are drawn from a normal distribution with mean 1/3 and standard deviation
-`MIXTURE_DEVIATION`. They are divided by the sum of their absolute values, or by `LEAST_WEIGHT` if
-the sum is smaller."""
+"""A mixture is a single colour channel with the probability `ONE_COLOUR_SHARE`. Otherwise its three
+weights are normally distributed with mean 1/3 and standard deviation `MIXTURE_DEVIATION`, and
+divided by the sum of their absolute values, or by `LEAST_WEIGHT` if the sum is smaller."""
 
 TONES = {"negative": 0.35, "curve": 0.7, "curves": 0.88}
 """Cumulative shares of three ways to change the tones of a view: a negative, one tone curve, or a
@@ -215,8 +208,7 @@ def draw_mixture(rng: np.random.Generator) -> np.ndarray:
 def change_tones(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
     """Change a view, (S, S) float32 in [0, 1], to what another sensor may see.
 
-    The view is inverted, changed by one tone curve, changed by two tone curves that blend into each
-    other across the view, or shown as edges.
+    The result is a negative, a tone curve, a blend of two tone curves, or an image of edges.
     """
 
     def curve() -> np.ndarray:

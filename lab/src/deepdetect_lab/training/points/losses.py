@@ -1,8 +1,6 @@
 """The loss of a pair of views: minus the expected fraction of keypoints that are found again.
 
-Candidates and their positions are fixed. The network learns only to rank them, by a logit for each.
-The logits are scaled to a fixed standard deviation, so that larger logits alone do not lower the
-loss.
+Candidates and their positions are fixed. The network only learns to rank them, by logits.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ CLOSE_PX, NEAR_PX = 1.0, 3.0
 
 SHARPNESS = 25.0
 """The logits of a view's keypoints are scaled to this standard deviation before the loss, so that
-larger logits alone do not lower it."""
+larger logits alone do not lower the loss."""
 
 TEMPERATURE = 0.6
 """Temperature of the sigmoid that maps scaled logits to probabilities. Chosen by hand."""
@@ -30,8 +28,7 @@ CLOSE_SHARE = 0.7
 of its reward if it is found again within 3 px."""
 
 MIN_CHOICE = 0.1
-"""Candidates that are chosen with a smaller probability than this have no partner in the other
-view, and are not the partner of another one. Chosen by hand."""
+"""Candidates chosen with a smaller probability are not matched between views. Chosen by hand."""
 
 MIN_SPREAD = 1e-3
 BISECTIONS = 40
@@ -40,9 +37,8 @@ BISECTIONS = 40
 def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
     """Return the loss of a pair of views, averaged over the directions from each to the other.
 
-    Its value is minus the expected fraction of keypoints that are found again. Its gradient keeps
-    the number of keypoints fixed: a candidate that becomes more likely displaces candidates near
-    the selection threshold, so their mean reward is subtracted from its own reward.
+    The gradient keeps the number of keypoints fixed: a candidate that becomes more likely displaces
+    candidates near the selection threshold, so their mean reward is subtracted from its own reward.
     """
     shares = [_choose(ranker, view, pair.budget) for view in pair.views]
     visible = [torch.from_numpy(view.visible) for view in pair.views]
@@ -60,10 +56,7 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
 
 
 def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
-    """Return the probability (N,) that each candidate is chosen.
-
-    It is 0 for candidates that are suppressed by a close one with a larger logit.
-    """
+    """Return the probability (N,) to choose a candidate: 0 if a close one has a larger logit."""
     logits = ranker(torch.from_numpy(view.features))
     radii = least_distances(view.sigma_px)  # the same as in detection
     kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))
@@ -76,7 +69,7 @@ def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Ten
 def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
     """Return sigmoid((logits - tau) / temperature), with tau such that the sum is `budget`.
 
-    If there are no more logits than the budget, all values are close to 1.
+    If there are at most `budget` logits, all values are close to 1.
     """
     fixed = logits.detach().double()
     if len(fixed) <= budget:
@@ -95,9 +88,8 @@ def _rewards(view: ViewCandidates, here: Tensor, there: Tensor) -> Tensor:
     """Return the reward (N,) of each candidate: the probability that its partner is chosen.
 
     The reward is lower if the partner is farther than 1 px away. Partners are mutual nearest
-    neighbours among the candidates that may be chosen, as in the validation. If all near candidates
-    counted instead of one partner, the loss would reward clusters, and fewer keypoints would be
-    found again within 1 px.
+    neighbours among the candidates that may be chosen. Counting all near candidates would reward
+    clusters.
     """
     pairs = mutual_pairs(view, NEAR_PX, here.numpy() > MIN_CHOICE, there.numpy() > MIN_CHOICE)
     close = view.distance_px[pairs] <= CLOSE_PX
@@ -113,8 +105,8 @@ def mutual_pairs(
 ) -> np.ndarray:
     """Return which pairs of candidates are mutual nearest neighbours within a radius.
 
-    The result holds indices into `view.first` and `view.second`. Only candidates count that are
-    marked in the masks: `possible_here` (N,) for this view, `possible_there` (M,) for the other.
+    The result holds indices into `view.first` and `view.second`. Only candidates that are marked in
+    the masks count: `possible_here` (N,) for this view, `possible_there` (M,) for the other view.
     """
     close = view.distance_px <= radius_px
     rows = np.flatnonzero(close & possible_here[view.first] & possible_there[view.second])

@@ -1,8 +1,7 @@
 """The validation metric of the ranker, on a fixed set of synthetic pairs.
 
-The functions of the benchmark measure the one-to-one repeatability of fixed numbers of keypoints
-(budgets), and the correct matches of upright descriptors. Keypoints where a view does not show the
-photograph are dropped before the best ones are taken.
+It combines the one-to-one repeatability of fixed numbers of keypoints (budgets) and the correct
+matches of upright descriptors. Keypoints where a view does not show the photograph are left out.
 """
 
 from __future__ import annotations
@@ -38,9 +37,8 @@ Detect = Callable[[np.ndarray], Keypoints]
 
 MEASURES = [f"@{radius:g} px {budget}" for budget in BUDGETS for radius in RADII_PX] + ["correct"]
 """Names of the measures of each kind of pair. "@1 px 512" is the mean repeatability within 1 px at
-a budget of 512 keypoints. "correct" is the mean number of matches that are correct within 1 px,
-divided by the number of keypoints at `MATCHING_BUDGET`. These matches are mutual nearest neighbours
-of upright RootSIFT of size 4 that pass a ratio test at 0.85."""
+a budget of 512 keypoints. "correct" is the mean number of upright RootSIFT matches that are correct
+within 1 px, divided by the number of keypoints at `MATCHING_BUDGET`."""
 
 
 def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPair]:
@@ -55,7 +53,7 @@ def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPai
 
 
 def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
-    """Return the "score" of a detector, and each measure of each kind of pair, "KIND MEASURE"."""
+    """Return the "score" of a detector, and its measures by kind of pair as "KIND MEASURE"."""
     repeated: dict[str, list[list[list[float]]]] = {kind: [] for kind in KINDS}
     correct: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:
@@ -79,8 +77,8 @@ def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
         repeated[pair.kind].append(rows)
     means = np.array([np.mean(repeated[kind], axis=0) for kind in KINDS])
     matched = [float(np.mean(correct[kind])) for kind in KINDS]
-    # Upright descriptors find no matches in zoomed and rotated pairs, which lowers the mean of
-    # `correct`, so it counts double.
+    # The mean of `matched` counts double, because it includes pairs with zoom and rotation, in
+    # which upright descriptors find no matches.
     score = 0.8 * means.mean(0).mean() + 0.2 * 2 * float(np.mean(matched))
     found = {"score": float(score)}
     for kind, fractions, share in zip(KINDS, means, matched, strict=True):

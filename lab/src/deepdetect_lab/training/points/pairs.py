@@ -18,13 +18,12 @@ from ..recipe import PointsTrainingOptions
 from .views import KINDS, ViewPair, draw_pair
 
 MAX_CANDIDATES = 2000
-"""Views give at most this number of candidates, the strongest. Chosen by hand; not measured."""
+"""A view has at most this number of candidates, the strongest ones. Chosen by hand."""
 
 REACH_PX = 3.0
 
 MIN_OVERLAP = 0.04
-"""Pairs whose views overlap by less than this fraction are drawn again. Chosen by hand; not
-measured."""
+"""Pairs whose views overlap by less than this fraction are drawn again. Chosen by hand."""
 
 ATTEMPTS = 5
 
@@ -127,7 +126,7 @@ class PairDataset(Dataset[CandidatePair]):
 
 
 def overlap(pair: ViewPair) -> float:
-    """Return the fraction of a view that the other view also shows: the smaller of both values."""
+    """Return the overlap: the smaller of the fractions of each view that the other view shows."""
     side = pair.images[0].shape[0]
     ticks = np.linspace(0, side - 1, 24)
     grid = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)

@@ -31,8 +31,7 @@ STATISTICS_PAIRS = 64
 
 WARM_UP_STEPS = 100
 FINAL_RATE = 0.02
-"""Cosine annealing ends at this fraction of the highest learning rate. Chosen by hand; not
-measured."""
+"""Cosine annealing ends at this fraction of the highest learning rate. Chosen by hand."""
 
 WEIGHT_DECAY = 1e-4
 
@@ -138,7 +137,7 @@ class RankerTrainer(Trainer):
         self.notes = {"images": str(len(self.files))}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches for steps `first` to `last` - 1, lists of pairs."""
+        """Return a loader of the batches, lists of pairs, for steps `first` to `last` - 1."""
         steps, pairs = range(first, self.steps if last is None else last), range(self.options.pairs)
         return DataLoader(
             PairDataset(self.files, self.options),
@@ -149,10 +148,7 @@ class RankerTrainer(Trainer):
         )
 
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
-        """Return the mean loss of pairs.
-
-        A pair counts as 0 if a view has fewer than two candidates.
-        """
+        """Return the mean loss of pairs, 0 for those with fewer than two candidates in a view."""
         losses = [
             pair_loss(self.network, pair)
             for pair in batch

@@ -1,8 +1,7 @@
 """Synthetic pairs of views of one photograph, with the homography between them.
 
 Pairs have one of four kinds of change, as the Oxford scenes have: zoom and rotation, blur,
-viewpoint, or light and JPEG. Each kind also gets a little of the other changes. A pair depends only
-on the photograph, the kind, the size and the random generator.
+viewpoint, or light and JPEG. Each kind also gets a little of the other changes.
 """
 
 from __future__ import annotations
@@ -31,9 +30,8 @@ from ..synthetic import (
 KINDS = ("zoom", "blur", "viewpoint", "light")
 
 BORDER_PX = 4
-"""Pixels of a view are not valid near the border of the photograph, because the surroundings of a
-candidate there include mirrored pixels. The margin is this number of pixels of the photograph, plus
-as many pixels of the view."""
+"""A view is not valid near the border of the photograph, because mirrored pixels are close. The
+margin is this number of pixels of the photograph, plus as many pixels of the view."""
 
 SUPERSAMPLING = 2
 """Views are rendered with twice the pixels along each side, so that they are not aliased."""
@@ -42,8 +40,8 @@ MAX_ENLARGEMENT = 2.2
 """Zoomed views enlarge the photograph by at most this factor, because more would only show blur."""
 
 SUBTLE = 0.25
-"""A view whose kind is not "blur" gets a weak blur with this probability. The same holds for
-changes of light and for JPEG compression. Chosen by hand."""
+"""Probability of a weak blur in views of a kind other than "blur". The same holds for weak changes
+of light and weak JPEG compression. Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),
@@ -54,9 +52,8 @@ CAMERAS = {
     "blur": replace(CAMERA, blur=Effect(1, 0.5, 4.5)),
     "light": replace(CAMERA, jpeg=Effect(0.5, 5, 60)),
 }
-"""`CAMERA` is the blur, noise and JPEG compression of most views. `CAMERAS` replaces it, for the
-kinds "blur" and "light", in the worse view of a pair. The JPEG quality of the Oxford scenes goes
-from 40 to 2, but below 5 little is left of a view of 224 pixels."""
+"""`CAMERAS` degrade the worse view of "blur" and "light" pairs, `CAMERA` all other views. The JPEG
+quality of the Oxford scenes goes from 40 to 2, but below 5 little is left of a small view."""
 
 LIGHT = Light(
     log_gamma=Effect(1, -0.8, 0.8),
@@ -86,8 +83,8 @@ class Change:
         any_turn: share of the pairs that are rotated by any angle, up to 180 degrees.
         tilt_deg: range of the tilt in degrees.
         still: share of the pairs with neither zoom nor rotation nor tilt.
-        scales: upper end of the range of the first view's scale, logarithmic from 0 to 1. At 0 the
-            view shows the whole shorter side of the photograph. At 1 it has the largest scale.
+        scales: upper limit of the first view's scale on a logarithmic axis: 0 is the scale that
+            shows the whole shorter side of the photograph, 1 is the largest scale allowed.
     """
 
     log_zoom: tuple[float, float]
@@ -110,8 +107,7 @@ CHANGES = {
 scenes: a viewpoint change of 60 degrees and a zoom of 4."""
 
 LEAST_LOG_ZOOM = math.log(1.3)
-"""Zooms up to this logarithm are always allowed, even if they enlarge the photograph by more than
-`MAX_ENLARGEMENT`."""
+"""Zooms up to this logarithm may enlarge the photograph by more than `MAX_ENLARGEMENT`."""
 
 ROTATED_SHARE = 0.2
 """Share of the pairs in which one random rotation is added to both views. Chosen by hand."""
