@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import importlib.util
 import platform
@@ -10,7 +9,6 @@ import re
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 from cyclopts import Parameter
@@ -175,7 +173,7 @@ def speeds() -> dict[str, object]:
     """Time detection and matching of images of 640x480 pixels, and OpenCV's SIFT for comparison."""
     import numpy as np
 
-    from .._shared.machine import processor_count
+    from .._shared.machine import processor_count, processor_name
     from .._shared.opencv import cv2
     from ..detector.detector import DeepDetect
     from ..detector.point_detector import PointDetector
@@ -211,13 +209,6 @@ def speeds() -> dict[str, object]:
         "images": "640x480",
         **{name: round(statistics.median(each[1:]), 1) for name, each in times.items()},
     }
-
-
-def processor_name() -> str:
-    """Return the marketing name of the processor if the system knows it."""
-    with contextlib.suppress(OSError, IndexError):
-        return re.findall(r"model name\s*: (.+)", Path("/proc/cpuinfo").read_text())[0]
-    return platform.processor() or platform.machine()
 
 
 CHECKS = (packages, opencv, self_test)

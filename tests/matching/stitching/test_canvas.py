@@ -71,6 +71,12 @@ def test_a_canvas_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         canvas.check_size(3.13)
 
 
+def test_a_canvas_without_a_pixel_is_refused() -> None:
+    canvas = planned({0: np.eye(3), 1: moved(100)}, scale=0.001)
+    with pytest.raises(OptionError):
+        canvas.check_size(1.0)
+
+
 def test_the_one_in_the_middle_is_least_stretched() -> None:
     angles = {4: -35, 1: 20, 7: 2, 2: 38}
     for frame in (0, 25):

@@ -10,7 +10,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from deepdetect._shared.machine import processor_count
+from deepdetect._shared.machine import processor_count, processor_name
 from deepdetect._shared.opencv import DISTRIBUTIONS
 
 RUNTIMES = ("onnxruntime", "openvino", "torch")
@@ -25,7 +25,7 @@ def provenance() -> dict[str, str]:
     return {
         "command": shlex.join(command),
         "commit": _commit(),
-        "machine": f"{platform.system()} {platform.machine()}, {processor_count()} processors",
+        "machine": f"{platform.system()}, {processor_name()}, {processor_count()} processors",
         "versions": ", ".join(_versions()),
     }
 

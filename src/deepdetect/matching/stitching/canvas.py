@@ -75,8 +75,10 @@ class Canvas:
         return right, bottom
 
     def check_size(self, max_megapixels: float) -> None:
-        """Raise an OptionError if the canvas has too many pixels or needs too much memory."""
+        """Raise an OptionError if the canvas has no pixel, too many, or needs too much memory."""
         width, height = self.size
+        if not (width and height):
+            raise OptionError("at this `scale` the panorama has no pixel: make it larger")
         if width * height > max_megapixels * 1e6:
             raise OptionError(
                 f"the panorama would be {width}x{height} pixels, {width * height / 1e6:.0f} "
