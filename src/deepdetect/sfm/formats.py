@@ -32,9 +32,8 @@ MESH_MARGIN = 0.5
 """The robust box of points for meshing is extended on each side by this fraction of its size."""
 
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
-"""A mesh's octree has a depth between the two `MESH_DEPTHS`, by the number of points. Where points
-are so sparse that it is over `MESH_TRIM` levels coarser, the surface is cut away. Chosen by
-hand."""
+"""The depth of a mesh's octree grows with the number of points, between the two `MESH_DEPTHS`. The
+surface is cut away where the octree is over `MESH_TRIM` levels coarser. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
 """A mesh needs this number of points: with only a handful, COLMAP's meshing crashes the process."""

@@ -184,7 +184,7 @@ def require_images(
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
-    """Raise an OptionError if images lack an end of the distance, or enough control points."""
+    """Raise an OptionError if `scale_by` names no image, or images show too few control points."""
     names = [*names]
     named = {Path(name).name: name for name in names} | {name: name for name in names}
     if control is not None:

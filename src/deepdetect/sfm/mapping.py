@@ -37,16 +37,15 @@ MIN_VIEWS = 3
 """A model needs at least this number of images. The function `reconstruct` is for two."""
 
 MAX_MODELS = 5
-"""At most this number of unconnected groups of images are mapped, each by itself. Chosen by
-hand."""
+"""At most this number of groups of connected images are mapped, each by itself. Chosen by hand."""
 
 MAX_FIRST_PAIRS = 20
 """The mapping tries at most this number of pairs of images as its first pair. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
-"""The mapping begins with two images whose lines of sight form 16 degrees, as COLMAP asks, if the
-camera did not move straight ahead. If it finds no such pair, or leaves out more connected images
-than it maps, a second attempt allows such motion and this angle. Chosen by hand."""
+"""The mapping begins with two images whose lines of sight form 16 degrees, and between which the
+camera did not move straight ahead, as in COLMAP. If there is no such pair, or more connected images
+are left out than mapped, a retry allows such motion and this angle. Chosen by hand."""
 
 ROBUST_SCALE_PX = 1.0
 """Scale of the Cauchy loss in bundle adjustment: larger errors count less. Chosen by hand."""
@@ -56,7 +55,7 @@ MAX_REFINED_ERROR_PX = 1.0
 
 ROUGH_TOLERANCE, TOLERANCE = 1e-6, 1e-8
 """Bundle adjustment ends when a step reduces the cost by less than this fraction. `ROUGH_TOLERANCE`
-holds before wrong observations are removed. Smaller tolerances move cameras by under a thousandth
+is used before wrong observations are removed. Smaller tolerances move cameras by under a thousandth
 of their error, and take four times as long."""
 
 MIN_ANGLE_DEG = 1.0
@@ -141,8 +140,8 @@ def map_images(
     """Estimate the poses of connected images one after the other, from verified pairs.
 
     With `known_cameras`, all intrinsics stay fixed. `registered` is called with the number of
-    images just added. Returns the largest `pycolmap.Reconstruction`, and the names of the images in
-    each other one.
+    images just added. Returns the largest `pycolmap.Reconstruction`, and the image names of each
+    smaller one.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()

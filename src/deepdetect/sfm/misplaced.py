@@ -21,13 +21,12 @@ from .colmap import quiet_pycolmap
 from .mapping import MAX_VERIFICATION_ERROR_PX, MIN_ANGLE_DEG, MIN_VERIFIED, adjust
 
 MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
-"""A point tests an image only if the lines of sight of the other images to it spread by this angle
+"""A point tests an image only if the other images' lines of sight to the point spread by this angle
 (root mean square). Otherwise, the point got its depth from the tested image itself."""
 
 MIN_GAIN = 1.5
-"""An image is moved if its new pose agrees with at least this multiple of the points of the old
-pose. The ratio was within 1 % of 1 for images in their right place, and 3 or more for misplaced
-ones."""
+"""An image is moved if the number of points that agree with a pose grows at least by this factor.
+The factor was within 1 % of 1 for images in their right place, and 3 or more for misplaced ones."""
 
 MAX_ROUNDS = 3
 """Images are checked in at most this number of rounds: corrected ones then improve the points."""
@@ -131,8 +130,7 @@ class _Points:
         """Match the keypoints of an image to the points whose depth other images determine.
 
         `matches` are numbers of other images, each with (M, 2) indices of matching keypoints in
-        this image and in the other image. Returns indices of keypoints, and the indices of their
-        points.
+        this image and in the other image. Returns indices of keypoints and of their points.
         """
         own, sights = self._sights[number]
         counts, sums = self._counts.copy(), self._sums.copy()

@@ -52,8 +52,8 @@ def write_transforms(
 ) -> None:
     """Write nerfstudio's transforms.json.
 
-    `files` gives files of each image, by their JSON key (such as "file_path") and by image name.
-    `points` is the file of the point cloud, and `more` are further values at the top level.
+    `files` maps a JSON key, such as "file_path", to the file of each image, by image name. `points`
+    is the file of the point cloud, and `more` are further values at the top level.
     """
 
     def relative(file: Path) -> str:

@@ -171,7 +171,7 @@ class Stages:
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
         """Return a folder that holds all images, and no results.
 
-        For a list of files, or if the output folder is inside the given one, it holds links.
+        For a list of files, or an output folder inside the given one, it holds links to the images.
         """
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():

@@ -55,8 +55,8 @@ MIN_DENSE_VIEWS = 3
 """A dense track needs at least this number of images: with two, no third one checks the match."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
-"""Images of up to `CACHED_PIXELS` together, at seven bytes each, are cached, but in any case
-`CACHED_IMAGES`, because successive images share neighbours."""
+"""Images are cached, because successive images share neighbours: at least `CACHED_IMAGES`, and more
+if all have at most `CACHED_PIXELS` pixels together (of seven bytes each)."""
 
 
 class Surfaces(NamedTuple):
@@ -173,7 +173,7 @@ class _Tracks:
     ) -> None:
         """Align patches of an image in other images, and turn them into points with tracks.
 
-        A patch becomes a point if it is found in at least `min_views` images, including its own. If
+        A patch becomes a point if at least `min_views` images show it, including its own. If
         `tracks` (K,) gives the model's point of each patch, only images that see the point are
         searched.
         """
