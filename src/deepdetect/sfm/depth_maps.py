@@ -94,8 +94,8 @@ NOISE_LEVELS = 1.0
 """Assumed noise of a pixel in grey levels: weaker gradients move no depth. Chosen by hand."""
 
 JUMPS = (16, 8, 4, 2, 1)
-"""In each of five passes, a pixel tries the planes of pixels at this distance in the depth map. A
-plane can thus spread over 31 pixels."""
+"""A pixel tries the planes of pixels at this distance in the depth map, one distance in each of
+five passes. A plane can thus spread over 31 pixels."""
 
 SURE_CORRELATION = 0.9
 """A pixel whose window correlates this well tries no other plane, to save time. Chosen by hand."""

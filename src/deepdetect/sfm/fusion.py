@@ -25,13 +25,14 @@ MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
 contains the point agree and are at least `MIN_ALL_VIEWS`. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
-"""Up to this distance from a depth edge, pixels on its near side must satisfy the rule for
+"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the rule for
 `ENOUGH_VIEWS`: windows give the background there the depth of the foreground. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
-"""In the middle of a surface, a pixel needs only `MIN_VIEWS` images that agree, because most wrong
-points are on small patches. It is there if at least `MIN_MIDDLE_SHARE` of 5 x 5 pixels around it,
-`MIDDLE_SPACING_PX` apart, lie on its surface and have as many images. Chosen by hand."""
+"""A pixel in the middle of a surface needs only `MIN_VIEWS` images that agree, because most wrong
+points are on small patches. A pixel is in the middle if at least `MIN_MIDDLE_SHARE` of 5 x 5 pixels
+around it, `MIDDLE_SPACING_PX` apart, lie on its surface and have `MIN_VIEWS` too. Chosen by
+hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
 """Pixels within `FILLED_RADIUS_PX` of the middle of their surface need only `MIN_FILLED_VIEWS`

@@ -33,7 +33,7 @@ MAX_SCALE_STD = 0.25
 deviation is larger if the positions lie too close together for their accuracy. Chosen by hand."""
 
 MAX_HEADING_STD_DEG = 20.0
-"""Largest standard deviation of the direction to north in a georeferenced model. Chosen by hand."""
+"""A georeferenced model's direction to north is at least this certain. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
 """If the positions leave the rotation about an axis less certain than this, a note says that this
@@ -401,7 +401,7 @@ def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
             f"the model has no point within {MAX_DISTANCE_PX:g} pixels of {end}: name a pixel with "
             "more texture around it"
         )
-    # Of points about equally close to the pixel, the one nearest to the camera hides the others.
+    # The point nearest to the camera hides others that are about equally close to the pixel.
     near = np.flatnonzero(distances < distances.min() + 2)
     return np.asarray(points[near[depth[near].argmin()]], np.float64)
 

@@ -37,7 +37,7 @@ MIN_VIEWS = 3
 """A model needs at least this number of images. The function `reconstruct` is for two."""
 
 MAX_MODELS = 5
-"""At most this number of groups of connected images are mapped, each by itself. Chosen by hand."""
+"""Unconnected groups of images become at most this number of models. Chosen by hand."""
 
 MAX_FIRST_PAIRS = 20
 """The mapping tries at most this number of pairs of images as its first pair. Chosen by hand."""

@@ -25,21 +25,21 @@ SPLAT_POINTS = 200_000
 JPEG_QUALITY = 95
 
 CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
-"""Each point covers a square of a depth map. Of the sides `CELLS_PX`, the first is used whose
-successor covers less than `CLOSED_GAIN` times the area: few gaps are left then. Chosen by hand."""
+"""Points cover squares in a depth map, with the first side of `CELLS_PX` whose successor covers
+less than `CLOSED_GAIN` times the area: few gaps are left then. Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
 """A pixel of a depth map whose depth exceeds that of a neighbouring pixel by more than this
 fraction is left out: it is seen through a gap in a nearer surface. Chosen by hand."""
 
 DEPTH_PERCENT = 95.0
-"""In each view, the depths of this percentage of the sparse points must fit into 16 bits."""
+"""The depths of this percentage of the sparse points in each view must fit into 16 bits."""
 
 MAX_VALUE_PER_UNIT = 1000.0
 """Depth maps store thousandths of the model's unit, or coarser steps if 16 bits are too few."""
 
 OPENGL = np.diag([1.0, -1, -1, 1])
-"""From nerfstudio's camera axes (y up, z backward) to this package's axes (y down, z forward)."""
+"""This maps nerfstudio's camera axes (y up, z backward) to this package's (y down, z forward)."""
 
 
 def write_transforms(

@@ -110,8 +110,8 @@ def add_dense_tracks(
 def _central_views(sparse: SparseModel) -> dict[str, tuple[Surfaces, np.ndarray]]:
     """Return, by image, the points that it sees most centrally, and their indices.
 
-    Of all images, the one nearest to the mean line of sight sees a point most centrally. The
-    surface at the point is assumed to face the mean direction.
+    The image nearest to the mean line of sight to a point sees it most centrally. The surface at
+    the point is assumed to face the mean direction.
     """
     images = [*sparse.images.values()]
     rows = np.concatenate([image.points for image in images])

@@ -37,7 +37,7 @@ JPEG_QUALITY = 97
 VALIDATION_SHARE = 1 / 20
 
 FREE_LICENCES = ("CC0", "CC BY", "CC BY-SA", "Unsplash")
-"""Names of free licences, which also allow weights trained on the images, begin with these."""
+"""Licences whose names begin with these allow any use, also of weights trained on the images."""
 
 RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECASE)
 """Licences with these words in their names restrict use, however the names begin."""

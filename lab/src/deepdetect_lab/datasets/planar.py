@@ -72,8 +72,7 @@ class PlanarScene:
         return [self.pairs[0].first, *(pair.second for pair in self.pairs)]
 
     def with_max_pairs(self, max_pairs: int) -> PlanarScene:
-        """Return the scene with at most `max_pairs` evenly spaced pairs; only the last one for
-        1."""
+        """Return the scene with at most `max_pairs` evenly spaced pairs, for 1 the last pair."""
         kept = self.pairs[-1:] if max_pairs == 1 else evenly_spaced(self.pairs, max_pairs)
         return replace(self, pairs=tuple(kept))
 
