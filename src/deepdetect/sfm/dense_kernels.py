@@ -350,9 +350,9 @@ def fuse_rows(  # type: ignore[no-untyped-def]
 
     A neighbour agrees if its own surface point reprojects to within `max_error` pixels of the
     pixel, and its inverse depth differs by at most the fraction `max_difference`. `views` (H, W)
-    counts the images that agree, `shown` (H, W) those whose frame contains the point, both with the
-    first. If all agreeing lines of sight are within `min_angle` radians of the first image's,
-    `views` is 0.
+    counts the images that agree, `shown` (H, W) those whose frame contains the point. Both include
+    the first image. If no agreeing line of sight differs by `min_angle` radians from the first
+    image's, `views` is 0.
     """
     for row in range(first, last):
         for column in range(planes.shape[1]):

@@ -32,7 +32,7 @@ MESH_MARGIN = 0.5
 """The robust box of points for meshing is extended on each side by this fraction of its size."""
 
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
-"""The depth of a mesh's octree grows with the number of points, between the two `MESH_DEPTHS`. The
+"""A mesh's octree has a depth between the `MESH_DEPTHS`, which grows with the number of points. The
 surface is cut away where the octree is over `MESH_TRIM` levels coarser. Chosen by hand."""
 
 MIN_MESH_POINTS = 100

@@ -30,8 +30,8 @@ EDGE_RADIUS_PX = 8
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
 """A pixel in the middle of a surface needs only `MIN_VIEWS` images that agree, because most wrong
-points are on small patches. A pixel is in the middle if at least `MIN_MIDDLE_SHARE` of 5 x 5 pixels
-around it, `MIDDLE_SPACING_PX` apart, lie on its surface and have `MIN_VIEWS` too. Chosen by
+points are on small patches. A pixel is in the middle if, of 5 x 5 pixels `MIDDLE_SPACING_PX` apart,
+at least `MIN_MIDDLE_SHARE` lie on its surface and have as many images that agree. Chosen by
 hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2

@@ -153,7 +153,7 @@ def georeference(
         scale_by: known distance, as in `MultiViewOptions`, which alone then determines the scale.
 
     Raises:
-        OptionError: the model lacks an end of the distance, or has too few control points.
+        OptionError: an end of the distance is not in the model, or it has too few control points.
         ReconstructionError: the control points contradict the model.
     """
     scale = None

@@ -45,7 +45,7 @@ MAX_FIRST_PAIRS = 20
 FORWARD_ANGLE_DEG = 4.0
 """The mapping begins with two images whose lines of sight form 16 degrees, and between which the
 camera did not move straight ahead, as in COLMAP. If there is no such pair, or more connected images
-are left out than mapped, a retry allows such motion and this angle. Chosen by hand."""
+are left out than mapped, a retry allows such motion and angles down to this. Chosen by hand."""
 
 ROBUST_SCALE_PX = 1.0
 """Scale of the Cauchy loss in bundle adjustment: larger errors count less. Chosen by hand."""
@@ -89,7 +89,7 @@ class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
     `images` are by name, in COLMAP's order. `points` (P, 3) have uint8 sRGB `colors` (P, 3) and
-    mean reprojection `errors` (P,) in pixels. `tracks` (P,) images see each point.
+    mean reprojection `errors` (P,) in pixels. `tracks` (P,) counts the images that see each point.
     """
 
     images: Mapping[str, RegisteredImage]
@@ -140,8 +140,8 @@ def map_images(
     """Estimate the poses of connected images one after the other, from verified pairs.
 
     With `known_cameras`, all intrinsics stay fixed. `registered` is called with the number of
-    images just added. Returns the largest `pycolmap.Reconstruction`, and the image names of each
-    smaller one.
+    images just added. Returns the largest `pycolmap.Reconstruction`, and each smaller one's image
+    names.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()

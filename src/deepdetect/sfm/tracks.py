@@ -74,8 +74,8 @@ class Surfaces(NamedTuple):
 def refine_tracks(model: Any, folder: Path, quiet: bool = True) -> None:
     """Replace the tracks of a `pycolmap.Reconstruction` by refined ones. Cameras stay fixed.
 
-    The image that sees a point from the middle of all directions gives its colour and a patch,
-    which is aligned in the other images of the track. With `quiet`, no progress bar is shown.
+    The image that sees a point from the middle of all directions gives the point's colour and a
+    patch to align in the other images of the track. With `quiet`, no progress bar is shown.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
@@ -174,7 +174,7 @@ class _Tracks:
         """Align patches of an image in other images, and turn them into points with tracks.
 
         A patch becomes a point if at least `min_views` images show it, including its own. If
-        `tracks` (K,) gives the model's point of each patch, only images that see the point are
+        `tracks` (K,) gives each patch's point of the model, only images that see the point are
         searched.
         """
         own = self.numbers[name]

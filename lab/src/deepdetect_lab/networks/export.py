@@ -83,7 +83,7 @@ def export_onnx(network: nn.Module, path: str | Path) -> None:
 
 
 def add_padding(model: ModelProto) -> None:
-    """Extend a network from `image` to `logits`: accept any size, and also output probabilities.
+    """Extend a network that maps `image` to `logits`: accept any size, also output probabilities.
 
     As in `compute_maps`, the last row and column of the image are repeated until its sides are
     multiples of 8, and the maps are cropped to the size of the image. Probabilities are clipped to
