@@ -140,8 +140,8 @@ def map_images(
     """Estimate the poses of connected images one after the other, from verified pairs.
 
     With `known_cameras`, all intrinsics stay fixed. `registered` is called with the number of
-    images just added. Returns the largest `pycolmap.Reconstruction`, and each smaller one's image
-    names.
+    images just added. Returns the largest `pycolmap.Reconstruction` and, for each smaller one, the
+    names of its images.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
