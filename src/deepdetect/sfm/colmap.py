@@ -1,8 +1,7 @@
 """Use COLMAP's camera models, and write its database, through pycolmap.
 
-The centre of the first pixel is (0.5, 0.5) in COLMAP and (0, 0) here, so half a pixel is added to
-positions for COLMAP. As the scale of a keypoint, COLMAP stores sigma, half of the diameter that
-OpenCV stores. COLMAP's orientations are in radians, OpenCV's in degrees. Both are clockwise.
+For a keypoint, OpenCV stores the diameter and the orientation in degrees. COLMAP stores half of the
+diameter as the scale, and the orientation in radians. Both measure orientations clockwise.
 """
 
 from __future__ import annotations
@@ -34,8 +33,7 @@ ROWS = 256
 """An image is undistorted in strips of this number of rows, which limits the memory needed."""
 
 ESTIMATED_FOCAL_FACTOR = 1.2
-"""An unknown focal length is first guessed as this factor times the longer side of the image, as in
-COLMAP. The mapping then refines the guess."""
+"""Guess of an unknown focal length, relative to the image's longer side, as in COLMAP."""
 
 
 @contextmanager
@@ -80,8 +78,7 @@ class CameraIntrinsics:
     ) -> CameraIntrinsics:
         """Return initial intrinsics with one radial distortion parameter. The mapping refines them.
 
-        `source` says where `focal_px` comes from. Without `focal_px`, the focal length is guessed,
-        and the source is "estimated".
+        Without `focal_px`, the focal length is guessed, and the source is "estimated".
         """
         if focal_px is None:
             focal_px, source = ESTIMATED_FOCAL_FACTOR * max(size), "estimated"
@@ -132,7 +129,7 @@ class CameraIntrinsics:
 
     @property
     def without_border(self) -> CameraIntrinsics:
-        """Pinhole intrinsics that COLMAP crops so that undistorted images have no empty border."""
+        """Pinhole intrinsics of the undistorted image, cropped so that it has no empty border."""
         pycolmap = import_pycolmap()
         cropped = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self.colmap_camera())
         return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
@@ -192,9 +189,8 @@ def initial_intrinsics(
 ) -> dict[str, CameraIntrinsics]:
     """Return the intrinsics of each image: those in `known`, or initial values to be refined.
 
-    `focal_px` is the initial focal length of images that are not in `known`. If it is None, the
-    focal length comes from EXIF or, without EXIF, from a guess. Images that share a camera
-    (`MultiViewOptions.single_camera`) get the same object.
+    An image not in `known` begins with the focal length `focal_px`, else that of EXIF, else a
+    guess. Images that share a camera (see `MultiViewOptions`) get the same object.
     """
     begins = {}
     for name, size in sizes.items():
@@ -214,8 +210,7 @@ def initial_intrinsics(
         name: {None: begin, True: begin.size, False: name}[single_camera]
         for name, begin in begins.items()
     }
-    # A shared camera takes the intrinsics of its first image in this order. Images with a guessed
-    # focal length come last, so that a focal length from EXIF is preferred.
+    # Images with a guessed focal length come last, so a shared camera prefers one from EXIF.
     for name in sorted(begins, key=lambda name: begins[name].source == "estimated"):
         shared.setdefault(keys[name], begins[name])
     return {name: shared[keys[name]] for name in sizes}
@@ -228,9 +223,8 @@ def write_database(
 ) -> None:
     """Write a new COLMAP database to a file that does not exist or is empty.
 
-    Images with the same intrinsics object share a camera. Keypoints are written as (x, y, scale,
-    orientation) if they have sizes, otherwise as (x, y). `sift_bytes` converts their descriptors.
-    The matches of a pair of images are (K, 2) indices of keypoints.
+    Images with the same intrinsics object share a camera. Keypoints without sizes are written
+    without scale and orientation. `matches` are (K, 2) indices of keypoints, by pair of images.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
         cameras: dict[int, tuple[int, int]] = {}  # camera ID and rig ID, by `id` of the intrinsics
@@ -275,10 +269,9 @@ def orientations_of(points: Keypoints) -> np.ndarray:
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
     """Convert descriptors to SIFT's format, (N, 128) uint8. Return None if this is impossible.
 
-    Descriptors of length 1 are multiplied by 512, as is usual for SIFT. A learned descriptor has 64
-    numbers of either sign. They become 128 numbers from 0 up, which COLMAP can compare: first the
-    positive parts, then the absolute values of the negative parts. The rounding to bytes loses one
-    or two of 100 correct matches. COLMAP's vocabulary trees suit only SIFT descriptors.
+    The 64 signed numbers of a learned descriptor become 128 numbers from 0 up: the positive parts,
+    then the absolute values of the negative parts. Descriptors of length 1 are multiplied by 512,
+    as is usual for SIFT. Rounding them loses one or two of 100 correct matches.
     """
     found = keypoints.descriptors
     if found is not None and is_learned(keypoints.descriptor_type):

@@ -1,9 +1,9 @@
 """Compiled kernels for dense points. Importing this module loads numba; first calls compile.
 
-Each kernel processes the rows `first` to `last - 1` of an image. The surface around a pixel is
-modelled as a plane, so its inverse depth is a linear function of the pixel position. The pixel
-(x, y) with inverse depth w projects to the neighbouring image at A (x, y, 1) + w b in homogeneous
-coordinates. A (3, 3) and b (3,) follow from the two cameras.
+Each kernel processes the rows `first` to `last - 1` of a reference image. Neighbours are other
+images of the scene. The surface around a pixel is modelled as a plane: its inverse depth w is
+linear in the pixel position. The pixel (x, y) projects to A (x, y, 1) + w b, in homogeneous pixels
+of a neighbour. A (3, 3) and b (3,) follow from the two cameras.
 """
 
 from __future__ import annotations
@@ -16,24 +16,20 @@ from .._shared.kernels import compiled
 from ..matching.stereo.kernels import count_bits
 
 HIDDEN = np.uint64(1) << np.uint64(63)
-"""A census has 62 bits. This higher bit marks pixels that the neighbouring image does not show."""
+"""A pixel's census has 62 bits. This higher bit marks pixels that the neighbour does not show."""
 
 MIN_TEXTURE = np.float32(0.18)
-"""A window has texture if the variance of its gradients along the epipolar line exceeds this
-multiple of the variance of the noise. Plain skies with JPEG artefacts lie below this threshold,
-weathered stone lies above it."""
+"""A window has texture if its gradients along the epipolar line have more than this multiple of the
+noise's variance. Plain skies with JPEG artefacts have less, weathered stone has more."""
 
 MIN_GAIN = np.float32(0.2)
-"""The computed shift of a window is divided by the reference's contrast relative to that of the
+"""The shift of a window is divided by the ratio of its contrast to that of its match in a
 neighbour. Smaller ratios count as this one, so that the shift does not become too large."""
 
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write, for pixels of row `y`, the sum of the two least Hamming distances to neighbours.
-
-    `line` (D, W) has one such sum for each of D inverse depths and each column.
-    """
+    """Write to `line` (D, W) the sum of the two least Hamming distances, for row `y`."""
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
     for d in range(count):
@@ -55,10 +51,9 @@ def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type:
 def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost):  # type: ignore[no-untyped-def]
     """Write the matching cost of each pixel at each of D inverse depths, (H, W, D) uint8.
 
-    At each pixel, the Hamming distances to the two neighbours that agree best are added. A cost is
-    the sum of these numbers over 3 x 3 pixels, divided by 8. `neighbours` (K, H', W') are the
-    censuses of neighbours, warped to the reference. In neighbour k, the pixel (x, y) at inverse
-    depth number d is at column `columns[k, d, x]` and row `rows[k, d, y]`.
+    A cost is the sum, over 3 x 3 pixels, of the Hamming distances to the two neighbours that agree
+    best, divided by 8. `neighbours` (K, H', W') are censuses of warped images. At the inverse depth
+    with index d, pixel (x, y) is at `columns[k, d, x]` and `rows[k, d, y]` of neighbour k.
     """
     height, width, count = cost.shape
     line = np.empty((count, width), np.uint8)
@@ -83,7 +78,7 @@ def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost)
 
 @compiled(nogil=True)
 def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
-    """Write the index of each pixel's least cost of D, (H, W) float32, refined by a parabola."""
+    """Write the index of each pixel's least cost, refined by a parabola, as (H, W) float32."""
     count = total.shape[2]
     for y in range(first, last):
         for x in range(total.shape[1]):
@@ -104,9 +99,9 @@ def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
 def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out):  # type: ignore[no-untyped-def]
     """Fit a plane around each pixel to the inverse depths within `tolerance` of its current plane.
 
-    `planes` (H, W, 3) float32 hold the inverse depth of a pixel, NaN if unknown, then its change
-    per pixel to the right, then per pixel down. If fewer than `min_pixels` inverse depths lie near
-    the current plane, the new inverse depth is NaN. `weights` (H, W) are those of the fit.
+    `planes` (H, W, 3) float32 hold, per pixel, the inverse depth (NaN if unknown) and its change
+    per pixel to the right and down. `weights` (H, W) weight the pixels in the fit. If fewer than
+    `min_pixels` inverse depths are within the tolerance, the new plane is NaN.
     """
     height, width = planes.shape[:2]
     for y in range(first, last):
@@ -137,7 +132,7 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
             e, f = siv - si * sv / n, sjv - sj * sv / n
             area = a * c - b * b
             more_right = more_down = 0.0
-            if area > n:  # else they lie on a line, and the slopes stay
+            if area > n:  # else the pixels lie on a line, and the slopes stay
                 more_right, more_down = (e * c - f * b) / area, (f * a - e * b) / area
             out[y, x, 0] = w + (sv - more_right * si - more_down * sj) / n
             out[y, x, 1] = right + more_right
@@ -146,10 +141,7 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
 
 @compiled(nogil=True, inline="always")
 def _project(m, x, y, w):  # type: ignore[no-untyped-def]
-    """Project pixel (x, y) with inverse depth w to a neighbour.
-
-    Returns x and y there, and the depth there divided by the depth here.
-    """
+    """Project a pixel to a neighbour; return x, y and (depth in the neighbour / depth here)."""
     z = m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3]
     across = m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]
     down = m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]
@@ -158,12 +150,12 @@ def _project(m, x, y, w):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  # type: ignore[no-untyped-def]
-    """Compare the window around a pixel with the window that its plane maps it to in a neighbour.
+    """Compare the window around a pixel with its match in a neighbour, given the pixel's plane.
 
     Returns correlation, shift, parallax and weight. The correlation is -1 if the neighbour does not
     show the whole window. The shift, in pixels along the epipolar line, is one Lucas-Kanade step
-    that compensates differences of contrast and brightness. The parallax is the motion of the match
-    in pixels per unit of inverse depth. The weight of the shift is 0 if the window has no texture.
+    that compensates differences of contrast and brightness. The parallax is how far the match
+    moves, in pixels per unit of inverse depth. The weight is 0 if the window has no texture.
     """
     nothing = np.float32(-1), np.float32(0), 0.0, np.float32(0)
     w, right, down = plane
@@ -246,12 +238,11 @@ def propagate_rows(  # type: ignore[no-untyped-def]
     first, last, planes, scores, jump, sure, stride, gray, neighbours, sizes, maps, radius, spacing,
     noise, out, found,
 ):  # fmt: skip
-    """Let each pixel that correlates worse than `sure` try the planes of four other pixels.
+    """Let each pixel whose window correlates worse than `sure` try the planes of four other pixels.
 
-    The others are `jump` pixels to the right, to the left, below and above. The pixel takes the
-    plane with which its window correlates best, or keeps its own. With a `jump` of 0, only the
-    correlation of its own plane is computed. `scores` (H, W) are the correlations of the given
-    planes, `found` those of the new planes. `refine_rows` describes the other arguments.
+    These lie `jump` pixels to the right, left, below and above. The pixel takes the plane that
+    correlates best. If `jump` is 0, only its own plane is tested. `scores` are the correlations of
+    the given planes, `found` those of the new ones. For the rest, see `refine_rows`.
     """
     height, width = gray.shape
     rows, columns = planes.shape[:2]
@@ -291,15 +282,15 @@ def refine_rows(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Refine each inverse depth by one Lucas-Kanade step that all neighbours share.
 
-    `planes` (H, W, 3) are as in `fit_rows`, one for every `stride`-th pixel of `gray` in both
-    directions, with slopes per pixel of `gray`. `neighbours` (K, H', W') float32 are padded images
-    whose true (width, height) are `sizes` (K, 2). `maps` (K, 3, 4) are A and b side by side. Every
-    `spacing`-th pixel of the window is compared if it lies on the surface of the middle pixel.
+    `planes` are as in `fit_rows`, for every `stride`-th pixel of `gray` in both directions, but
+    with slopes per pixel of `gray`. `neighbours` (K, H', W') float32 are padded images of (width,
+    height) `sizes` (K, 2). `maps` (K, 3, 4) are A and b side by side. Every `spacing`-th pixel of a
+    window is compared if its inverse depth is within `tolerance` of the middle pixel's plane.
 
-    `out` are the new inverse depths. `errors` are root mean square distances, in pixels, to the
-    matches that each neighbour alone would give. An inverse depth becomes NaN if fewer than
-    `min_number` neighbours correlate by `min_correlation`. It stays if none of them has texture
-    along the epipolar line. `certainty` is 0 in both cases.
+    The new inverse depth `out` is NaN if fewer than `min_number` neighbours reach
+    `min_correlation`. It is the old one if they have no texture along the epipolar line. In both
+    cases, `certainty` is 0. `errors` are root mean square distances, in pixels, from the match at
+    the new inverse depth to the matches that each neighbour alone would give.
     """
     height, width = gray.shape
     side = 2 * radius + 1
@@ -351,18 +342,17 @@ def fuse_rows(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Write, for each pixel of the first map, the mean inverse depth of the maps that agree on it.
 
-    The first map `planes` (H, W, 3) and the `neighbours` (K, H', W', 3) hold every `stride`-th
-    pixel in both directions, with NaN where the depth is unknown. `sizes` (K, 2) are the numbers of
-    rows and columns of the neighbours. `there` (K, 3, 4) are A and b from the first image to each
-    neighbour, `back` (K, 3, 4) those from each neighbour to the first. `rays` (3, 3) maps pixels
-    (x, y, 1) to lines of sight. `centres` (K, 3) are the neighbours' camera centres in the frame of
-    the first camera.
+    The first map `planes` and the padded `neighbours` (K, H', W', 3) are as in `refine_rows`.
+    `sizes` (K, 2) are the rows and columns of the neighbours. `there` (K, 3, 4) are A and b from
+    the first image to each neighbour, `back` (K, 3, 4) those in the other direction. `rays` (3, 3)
+    maps pixels (x, y, 1) to lines of sight. `centres` (K, 3) are the neighbours' camera centres in
+    the frame of the first camera.
 
-    A neighbour agrees if the point of its own surface reprojects to within `max_error` pixels, and
-    its inverse depth differs by at most the fraction `max_difference`. `views` (H, W) is the number
-    of images that agree, including the first. It is 0 if no line of sight of a neighbour differs
-    from that of the first image by `min_angle` radians. `shown` (H, W) is the number of images
-    whose frame contains the point, including the first.
+    A neighbour agrees if its own surface point reprojects to within `max_error` pixels of the
+    pixel, and its inverse depth differs by at most the fraction `max_difference`. `views` (H, W)
+    counts the images that agree, `shown` (H, W) those whose frame contains the point. Both include
+    the first image. If no agreeing line of sight differs by `min_angle` radians from the first
+    image's, `views` is 0.
     """
     for row in range(first, last):
         for column in range(planes.shape[1]):
@@ -409,11 +399,9 @@ def fuse_rows(  # type: ignore[no-untyped-def]
 def support_rows(first, last, planes, stride, chosen, reach, spacing, tolerance, support):  # type: ignore[no-untyped-def]
     """Write, per pixel, the fraction of the pixels around it that are `chosen` and on its surface.
 
-    The pixels around it are every `spacing`-th one, in both directions, of a square that reaches
-    `reach` pixels to each side. They include the pixel itself, but none outside the map. `chosen`
-    (H, W) is a mask, and `planes` are as in `fuse_rows`. A pixel is on the surface if its inverse
-    depth differs from the middle pixel's plane by at most `tolerance` times the inverse depth of
-    the middle pixel.
+    The pixels around it, with itself, are every `spacing`-th one, up to `reach` in both directions.
+    `chosen` (H, W) is a mask, and `planes` are as in `refine_rows`. Pixels are on the surface if
+    they differ in inverse depth from the middle pixel's plane by at most the fraction `tolerance`.
     """
     height, width = chosen.shape
     for row in range(first, last):

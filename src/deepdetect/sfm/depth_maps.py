@@ -1,9 +1,8 @@
 """Compute depth maps of images whose cameras are known.
 
-Semi-global matching of downscaled copies gives the first inverse depths. Each pixel then gets a
-plane, so that slanted surfaces are matched as well as frontal ones. Pixels that correlate badly may
-take over the plane of another pixel, and matching of the full-size grey images refines all planes.
-A pixel without texture gets a depth only if it lies between textured pixels of the same surface.
+Semi-global matching of downscaled images gives inverse depths, to which planes are fitted. Pixels
+that correlate badly may take the plane of another pixel. Full-size grey images then refine all
+planes. A pixel without texture gets a depth only between textured pixels of the same surface.
 """
 
 from __future__ import annotations
@@ -49,12 +48,10 @@ CACHED_IMAGES = 16
 """A process caches this number of undistorted images: successive images share neighbours."""
 
 SMALL_SCALE = 0.5
-"""Images are scaled by at most this factor for semi-global matching. Halving the factor divides the
-time by eight."""
+"""Images are scaled by at most this for semi-global matching. Halving it divides the time by 8."""
 
 MAX_VOLUME = 3e7
-"""Images are scaled down further for semi-global matching if their number of pixels, times the
-number of inverse depths, would exceed this. This limits the memory."""
+"""Limit for the costs (pixels times inverse depths) in semi-global matching, to save memory."""
 
 TAIL_FRACTION, DEPTH_MARGIN = 0.002, 0.2
 """The search range spans the inverse depths of the sparse points. `TAIL_FRACTION` of the points is
@@ -66,48 +63,42 @@ MIN_FAR = 0.1
 sparse points, so that it stays above 0. Chosen by hand."""
 
 MAX_APPROACH = 0.5
-"""The search first aligns all images at one depth of the first image, which must lie ahead of all
-cameras. A camera ahead of the first one has covered at most this fraction of the way to that depth.
-Chosen by hand."""
+"""The search aligns all images at one depth of the first image. The depth is so large that no other
+camera has moved ahead by more than this fraction of it. Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
-"""One step of inverse depth in the search should move a match by one pixel. Some matches move more
-than others, so this quantile of the motions over the image is used. It is the median, because
-matches near the epipole hardly move."""
+"""One step of inverse depth in the search moves a match by one pixel, at this quantile of all
+matches. It is the median, because matches near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
-"""Two inverse depths belong to different surfaces if their matches are farther apart than this in
-the downscaled images of the search."""
+"""Two inverse depths belong to one surface if their matches in the downscaled images of the search
+are at most this far apart."""
 
 FIT_RADIUS_PX = 3
 """Planes are fitted to the downscaled depth map in windows of this radius. Chosen by hand."""
 
 FIT_TOLERANCES_PX = (4, 2, 1)
-"""Planes are fitted three times, each time to the inverse depths within this tolerance of the
-current plane, in steps of the search. The first planes are frontal. The first tolerance is wide, so
-that the fit can turn them into steep surfaces such as the ground. Chosen by hand."""
+"""Tolerances of three successive plane fits, in steps of the search. The first one is wide, so that
+planes that begin frontal can become as steep as the ground. Chosen by hand."""
 
 MIN_FITTED = 12
 """A plane must fit at least this number of pixels: smaller patches are wrong. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
-"""Windows that reach `WINDOW_RADIUS_PX` to each side of a pixel are compared. Only pixels
-`WINDOW_SPACING_PX` apart in them are read. Chosen by hand."""
+"""Radius of the compared windows, and spacing of the pixels read in them. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
-"""Images are blurred with this sigma before windows are compared. Only some of the pixels of a
-window are read, and after the blur they represent the others."""
+"""Sigma of the blur that lets the pixels read in a window represent those between them."""
 
 NOISE_LEVELS = 1.0
 """Assumed noise of a pixel in grey levels: weaker gradients move no depth. Chosen by hand."""
 
 JUMPS = (16, 8, 4, 2, 1)
-"""Pixels try the planes of pixels at this distance in the depth map, one distance in each of five
-passes. A plane can thus spread over 31 pixels."""
+"""A pixel tries the planes of pixels at this distance in the depth map, one distance in each of
+five passes. A plane can thus spread over 31 pixels."""
 
 SURE_CORRELATION = 0.9
-"""A pixel whose window correlates at least this well with other images keeps its plane, and does
-not try those of other pixels, which saves time. Chosen by hand."""
+"""A pixel whose window correlates this well tries no other plane, to save time. Chosen by hand."""
 
 MIN_CORRELATION = 0.5
 """A neighbour refines a depth only if the windows correlate at least this well. Chosen by hand."""
@@ -117,19 +108,17 @@ SMOOTHING_RADII = (4, 3)
 radius, in pixels of the depth map. Chosen by hand."""
 
 MIN_WEIGHT = 0.02
-"""Weight of a pixel without texture when planes are smoothed. Half of the textured pixels have
-weights above 0.5."""
+"""Weight of untextured pixels in smoothing. Half of the textured pixels have weights above 0.5."""
 
 MIN_VIEWS = 3
-"""The depth of a pixel is kept only if at least this number of images agree on it, including the
-pixel's own: a third image confirms the match of two. `fusion` asks for other numbers in some
-places, such as depth edges."""
+"""A depth is kept if at least this number of images agree on it, its own included: a third image
+confirms two. `fusion` asks for other numbers in some places, such as depth edges."""
 
 DEPTH_PIXEL = np.dtype(
     [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True
 )
-"""A pixel of a depth map. `plane` is its inverse depth (NaN if unknown), then the change of inverse
-depth per image pixel to the right, then down. `error` is the root mean square distance, in pixels,
+"""A pixel of a depth map. `plane` is its inverse depth (NaN if unknown), and the change of inverse
+depth per image pixel to the right and down. `error` is the root mean square distance, in pixels,
 from the matches at this depth to those that each neighbour alone would give. `color` is sRGB."""
 
 
@@ -203,7 +192,6 @@ def _search(
     """
     from .dense_kernels import choose_rows, cost_rows
 
-    # Neighbours are aligned at one depth, which must lie ahead of them even if they moved forward.
     passed = max(-relative_projection(views[0], view)[1][2] for view in views[1:])
     middle = min(float(np.mean(searched)), MAX_APPROACH / max(passed, 1e-9))
     parallax = max(_parallax(views[0], view, middle) for view in views[1:])
@@ -259,10 +247,9 @@ def _search(
 def _warped_census(
     gray: np.ndarray, warp: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
-    """Return the census of an image after a homography has warped it.
+    """Return the census of an image warped by a homography, `HIDDEN` where the image ends.
 
     `first` and `last` are the upper left and the lower right pixel (x, y) of the warped image.
-    Pixels that the image does not show become `HIDDEN`.
     """
     from .dense_kernels import HIDDEN
 
@@ -349,7 +336,7 @@ def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: f
 
 
 def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return a mask of `known` pixels and of those below them, until a new surface `begins`."""
+    """Return a mask of `known` pixels and of the pixels below until a new surface `begins`."""
     rows = np.arange(len(known))[:, None]
     last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
     return last >= first
@@ -367,17 +354,13 @@ def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray
 def relative_projections(
     first: PosedView, others: Sequence[PosedView], back: bool = False
 ) -> np.ndarray:
-    """Return A and b side by side, (K, 3, 4), from the first view to K others (`back`: to it)."""
+    """Return A and b side by side, (K, 3, 4), from the first view to K others, or `back` to it."""
     pairs = [(other, first) if back else (first, other) for other in others]
     return np.array([np.column_stack(relative_projection(*pair)) for pair in pairs])
 
 
 def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> float:
-    """Return the motion of matches in pixels per unit of inverse depth, at a given inverse depth.
-
-    It is the `PARALLAX_QUANTILE` of the motions all over the image, because matches near the
-    epipole do not move. The epipole lies ahead of a camera that moves forward.
-    """
+    """Return how far matches move, in pixels per unit of inverse depth, at an inverse depth."""
     matrix, vector = relative_projection(first, second)
     x, y = (np.linspace(0, side - 1, 7)[1:-1] for side in first.camera.size)
     pixels = np.array([[across, down, 1] for across in x for down in y])

@@ -29,13 +29,11 @@ LAZ_STEP_M = 0.001
 """Coordinates in LAZ files are rounded to multiples of this, in metres."""
 
 MESH_MARGIN = 0.5
-"""Meshing uses only points inside the robust bounding box, extended on each side by this fraction
-of its size."""
+"""The robust box of points for meshing is extended on each side by this fraction of its size."""
 
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
-"""The depth of a mesh's octree grows with the number of points, between the two `MESH_DEPTHS`.
-Where points are sparse, the octree is coarser. Where it is more than `MESH_TRIM` levels above its
-full depth, the surface is cut away. Chosen by hand."""
+"""A mesh's octree has a depth between the `MESH_DEPTHS`, which grows with the number of points. The
+surface is cut away where the octree is over `MESH_TRIM` levels coarser. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
 """A mesh needs this number of points: with only a handful, COLMAP's meshing crashes the process."""
@@ -148,11 +146,7 @@ def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> No
 
 
 def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a PLY mesh that COLMAP wrote.
-
-    Returns the vertices, a structured array (N,) with fields such as "x" and "red", and the
-    triangles, (M, 3) indices of vertices.
-    """
+    """Return the vertices of COLMAP's PLY mesh, as a structured array, and the triangles (M, 3)."""
     header, _, data = path.read_bytes().partition(b"end_header\n")
     counts = [int(number) for number in re.findall(rb"element \w+ (\d+)", header)]
     fields = re.findall(r"property (float|uchar) (\w+)", header.decode("ascii"))

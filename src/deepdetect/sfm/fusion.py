@@ -14,33 +14,29 @@ from ..geometry.camera import PosedView
 from .depth_maps import MIN_VIEWS, relative_projections
 
 MAX_ERROR_PX = 1.0
-"""The depth map of a neighbour agrees with the depth of a pixel if the point of its own surface
-reprojects to within this distance of the pixel. Chosen by hand; COLMAP's fusion allows 2 px."""
+"""A neighbour agrees with a pixel's depth if the neighbour's own surface point reprojects to within
+this distance of the pixel. Chosen by hand; COLMAP's fusion allows 2 px."""
 
 MAX_DEPTH_DIFFERENCE = 0.01
-"""Two inverse depths agree, or belong to one surface, if they differ by at most this fraction.
-COLMAP's fusion also allows 1 %."""
+"""Inverse depths agree if they differ by at most this fraction. COLMAP's fusion also allows 1 %."""
 
 MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
-"""A pixel becomes a point, wherever it lies, if at least `ENOUGH_VIEWS` images agree on its depth.
-If the point is in the frame of fewer images than that, all of them must agree, and they must be at
-least `MIN_ALL_VIEWS`. Chosen by hand."""
+"""A pixel becomes a point if `ENOUGH_VIEWS` images agree on its depth, or if all images whose frame
+contains the point agree and are at least `MIN_ALL_VIEWS`. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
-"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the strict
-rule of `MIN_ALL_VIEWS` and `ENOUGH_VIEWS`. There, matching windows give pixels of the background
-the depth of the foreground, in all images alike. Chosen by hand."""
+"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the rule for
+`ENOUGH_VIEWS`: windows give the background there the depth of the foreground. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
-"""Pixels in the middle of a surface need only `MIN_VIEWS` images that agree, because most wrong
-points are on small patches. The middle is tested with 5 x 5 pixels that are `MIDDLE_SPACING_PX`
-apart: at least the fraction `MIN_MIDDLE_SHARE` of them must lie on the surface, and `MIN_VIEWS`
-images must agree on each of these. Chosen by hand."""
+"""A pixel in the middle of a surface needs only `MIN_VIEWS` images that agree, because most wrong
+points are on small patches. A pixel is in the middle if, of 5 x 5 pixels `MIDDLE_SPACING_PX` apart,
+at least `MIN_MIDDLE_SHARE` lie on its surface and have as many images that agree. Chosen by
+hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
-"""Pixels within `FILLED_RADIUS_PX` of the middle of their surface (see `MIN_MIDDLE_SHARE`) need
-only `MIN_FILLED_VIEWS` images that agree, because other images may not show this part of the
-surface. Chosen by hand."""
+"""Pixels within `FILLED_RADIUS_PX` of the middle of their surface need only `MIN_FILLED_VIEWS`
+images that agree, because other images may not show this part of it. Chosen by hand."""
 
 MIN_TRIANGULATION_DEG = 1.0
 """A point is kept only if the line of sight of at least one image that agrees on it differs by this
@@ -59,9 +55,8 @@ DENSE_POINT = np.dtype(
         ("views", np.uint8),
     ]
 )
-"""A dense point, which comes from a pixel of the depth map of a reference image. `normals` is a
-unit vector towards the camera of this image. `errors` is the `error` of the pixel (see
-`DEPTH_PIXEL`). `colors` is sRGB. `views` is the number of images that agree on the point."""
+"""A dense point, from a pixel of a depth map. `normals` is a unit vector facing the map's camera,
+`errors` the `error` of `DEPTH_PIXEL`, `colors` sRGB, `views` the number of images that agree."""
 
 
 def fuse_depth_maps(
@@ -104,8 +99,7 @@ def fuse_depth_maps(
 def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px: int) -> np.ndarray:
     """Return a mask of the pixels on which enough images agree.
 
-    `count` (H, W) is the number of images that agree, `shown` (H, W) the number of images whose
-    frame contains the point of the pixel.
+    `count` (H, W) images agree on a pixel, and `shown` (H, W) images have its point in their frame.
     """
     from .dense_kernels import support_rows
 
@@ -148,10 +142,7 @@ def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px:
 
 
 def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
-    """Return whether a view may show part of a box, given the box's corners (8, 3).
-
-    It cannot if all corners lie beyond one side of the frustum, widened by a margin.
-    """
+    """Return False if all corners (8, 3) of a box lie beyond one side of the widened frustum."""
     seen = (corners @ view.rotation.T + view.translation) @ view.camera.matrix.T
     xy, depth = seen[:, :2], seen[:, 2:]
     inside = [depth, xy + margin_px * depth, (np.array(view.camera.size) + margin_px) * depth - xy]

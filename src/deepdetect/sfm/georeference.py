@@ -20,36 +20,31 @@ from .colmap import import_pycolmap
 from .mapping import SparseModel
 
 GPS_ACCURACY_M = 3.0
-"""Accuracy in metres that is assumed for GPS positions that do not state theirs. Usual receivers
-reach it in the open."""
+"""Assumed accuracy of GPS positions that state none. Usual receivers reach it in the open."""
 
 CONTROL_ACCURACY_M = 0.1
-"""Accuracy in metres that is assumed for ground control points. They are surveyed to centimetres,
-and marked in the images to within a few pixels."""
+"""Assumed accuracy of control points: surveyed to centimetres, marked to within a few pixels."""
 
 MIN_FIXES = 3
-"""The fit needs at least this number of positions that agree: with two, the rotation about the line
-through them would be undetermined."""
+"""A fit needs this number of positions: two would leave open the rotation about their line."""
 
 MAX_SCALE_STD = 0.25
 """A model is georeferenced only if the relative standard deviation of its scale is below this. The
 deviation is larger if the positions lie too close together for their accuracy. Chosen by hand."""
 
 MAX_HEADING_STD_DEG = 20.0
-"""A model is georeferenced only if the standard deviation of its direction to north is below this.
-Chosen by hand."""
+"""A georeferenced model's direction to north is at least this certain. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""If the positions alone leave the rotation about an axis with a larger standard deviation, a note
-says that this rotation relies on the assumption of upright cameras."""
+"""If the positions leave the rotation about an axis less certain than this, a note says that this
+rotation relies on the assumption of upright cameras."""
 
 GRAVITY_STD_DEG = 2.0
-"""Standard deviation that is assumed for the angles of a gimbal. Chosen by hand."""
+"""Assumed standard deviation of the angles that a drone's gimbal reports. Chosen by hand."""
 
 UPRIGHT_STD_DEG, AHEAD_STD_DEG = 5.0, 25.0
-"""Without a gimbal, the rows of a photograph are assumed to be level, with the standard deviation
-`UPRIGHT_STD_DEG`. The optical axes are assumed to be level on average, with the standard deviation
-`AHEAD_STD_DEG`. Chosen by hand."""
+"""Assumed standard deviations without a gimbal: of image rows from level, and of the mean of all
+optical axes from level. Chosen by hand."""
 
 DOWNWARD_SHARE = 0.1
 """Without a gimbal, "down" is first taken as the mean direction of the image columns plus this
@@ -65,10 +60,7 @@ follows from the assumption that the cameras are held upright"
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a model: WGS 84 latitude and longitude in degrees, and height in metres.
-
-    The axes of the model point east, north and up from here, in metres.
-    """
+    """Origin of a model: WGS 84 latitude and longitude in degrees, and height in metres."""
 
     latitude: float
     longitude: float
@@ -105,8 +97,7 @@ class Georeference:
             known.
         residuals: given position minus position in the model, (3,) in metres east, north and up, by
             name of the image (GPS) or of the control point.
-        wrong: names of the images or control points whose positions contradict the others. These
-            positions were left out.
+        wrong: images or control points that were left out, because they contradict the others.
         fit: the fitted similarity with its uncertainty; None for a known distance.
     """
 
@@ -159,11 +150,10 @@ def georeference(
         points: (N, 3) dense points. The ends of the known distance may be dense or sparse points.
         folder: folder of the images.
         control: ground control points, which are used instead of GPS.
-        scale_by: known distance as in `MultiViewOptions`. Its scale is used instead of the one from
-            control points or GPS.
+        scale_by: known distance, as in `MultiViewOptions`, which alone then determines the scale.
 
     Raises:
-        OptionError: the model lacks an end of the distance, or has too few control points.
+        OptionError: an end of the distance is not in the model, or it has too few control points.
         ReconstructionError: the control points contradict the model.
     """
     scale = None
@@ -194,7 +184,7 @@ def require_images(
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
-    """Raise an OptionError if images lack an end of the distance, or enough control points."""
+    """Raise an OptionError if `scale_by` names no image, or images show too few control points."""
     names = [*names]
     named = {Path(name).name: name for name in names} | {name: name for name in names}
     if control is not None:
@@ -263,10 +253,9 @@ def upright(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Estimate from the cameras which direction is up, and which directions are level.
 
-    If a gimbal reports gravity, the directions perpendicular to it are level. Without a gimbal, the
-    rows of the photographs are assumed to be level and, less certainly, the optical axes. Returns a
-    unit vector up (3,) and, for `fit_similarity`, the level vectors (L, 3) and their standard
-    deviations (L,) in radians.
+    If a gimbal reports gravity, directions perpendicular to it are level. Otherwise, image rows
+    and, less certainly, optical axes are assumed to be level. Returns the unit vector up (3,) and,
+    for `fit_similarity`, level vectors (L, 3) and their standard deviations (L,) in radians.
     """
     level, stds, down = [], [], []
     for name, view in views.items():
@@ -347,8 +336,7 @@ def _seen_by_several(
 ) -> dict[str, dict[str, ControlRow]]:
     """Return the control points that are marked in two or more of the named images.
 
-    The result maps the name of a point, and then the full name of an image, to the `ControlRow`.
-    `names` maps the names that control points may use for images to full names.
+    `names` maps image names in the file to full names. The result is by point, then by full name.
     """
     seen: dict[str, dict[str, ControlRow]] = {}
     for row in control:
@@ -390,8 +378,8 @@ def scale_by_distance(
 ) -> float:
     """Return the metres per unit of a model, from the known distance between two places in it.
 
-    An end of the distance is the name of an image, which stands for the position of its camera, or
-    NAME:X,Y, which stands for the one of the `points` (N, 3) that this pixel of the image shows.
+    An end is the name of an image, for the position of its camera, or NAME:X,Y, for the one of the
+    `points` (N, 3) that this pixel of the image shows.
     """
     one, other = (_end(end, sparse, points) for end in (end0, end1))
     length = float(np.linalg.norm(one - other))
@@ -413,8 +401,7 @@ def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
             f"the model has no point within {MAX_DISTANCE_PX:g} pixels of {end}: name a pixel with "
             "more texture around it"
         )
-    # If several points are about equally close to the pixel, the one nearest to the camera hides
-    # the others.
+    # The point nearest to the camera hides others that are about equally close to the pixel.
     near = np.flatnonzero(distances < distances.min() + 2)
     return np.asarray(points[near[depth[near].argmin()]], np.float64)
 

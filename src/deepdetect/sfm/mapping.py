@@ -23,67 +23,59 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
 MIN_VERIFIED = 30
-"""A pair of images is used only if its two-view geometry has at least this number of inliers.
-COLMAP also needs 30 inliers to register an image. Some 20 of 8,192 keypoints agree by chance, and
-wrong pairs slow the mapping down tenfold."""
+"""A pair of images is used only if its two-view geometry has at least this number of inliers. Some
+20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
 
 MAX_VERIFICATION_ERROR_PX = 4.0
 """A match is an inlier if its geometric error is at most this, which is COLMAP's default."""
 
 MAX_TRIALS = 5000
-"""RANSAC draws at most this number of samples for a pair of images. COLMAP's limit is 10,000, and
-mostly pairs that show different places reach it. If many pairs are compared, that limit costs more
-time than the mapping."""
+"""RANSAC draws at most this number of samples per pair of images. With COLMAP's 10,000, many pairs
+that show different places would take more time than the mapping."""
 
 MIN_VIEWS = 3
 """A model needs at least this number of images. The function `reconstruct` is for two."""
 
 MAX_MODELS = 5
-"""If matches do not connect all images, at most this number of connected components are mapped,
-each to a model of its own. Chosen by hand."""
+"""Unconnected groups of images become at most this number of models. Chosen by hand."""
 
 MAX_FIRST_PAIRS = 20
-"""The mapping tries at most this number of pairs of images to begin with. Chosen by hand."""
+"""The mapping tries at most this number of pairs of images as its first pair. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
-"""The mapping begins with a pair of images. In the first attempt, lines of sight to a point must
-form an angle of 16 degrees, as COLMAP asks, and the camera must not have moved straight ahead. The
-second attempt asks only for this angle, and allows such motion. It follows if the first one finds
-no pair, as in a clip from a car, or leaves out more connected images than it maps. Chosen by
-hand."""
+"""The mapping begins with two images whose lines of sight form 16 degrees, and between which the
+camera did not move straight ahead, as in COLMAP. If there is no such pair, or more connected images
+are left out than mapped, a retry allows such motion and angles down to this. Chosen by hand."""
 
 ROBUST_SCALE_PX = 1.0
 """Scale of the Cauchy loss in bundle adjustment: larger errors count less. Chosen by hand."""
 
 MAX_REFINED_ERROR_PX = 1.0
-"""Observations of refined tracks with a larger reprojection error are removed, because such a patch
-shows something else."""
+"""Observations of refined tracks with larger errors are removed: they show something else."""
 
 ROUGH_TOLERANCE, TOLERANCE = 1e-6, 1e-8
-"""A bundle adjustment ends when a step reduces the cost by less than this fraction.
-`ROUGH_TOLERANCE` is for the adjustment before wrong observations are removed, `TOLERANCE` for the
-last one. Smaller tolerances move cameras by under a thousandth of their error, and take four times
-as long."""
+"""Bundle adjustment ends when a step reduces the cost by less than this fraction. `ROUGH_TOLERANCE`
+is used before wrong observations are removed. Smaller tolerances move cameras by under a thousandth
+of their error, and take four times as long."""
 
 MIN_ANGLE_DEG = 1.0
-"""A point is kept only if two of its lines of sight form at least this angle. Chosen by hand;
-COLMAP asks for 1.5 degrees."""
+"""Two lines of sight to each point must form this angle. Chosen by hand; COLMAP asks for 1.5."""
 
 MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION = 0.1, 10.0, 1.0
 """COLMAP's limits for plausible cameras: the first two for the focal length divided by the longer
 side, the third for the absolute values of the distortion parameters."""
 
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
-"""The principal points of unknown cameras are estimated only if each camera took at least this
-number of images. Otherwise they are the middle of the image. Chosen by hand."""
+"""Principal points are estimated only if each camera took at least this number of images.
+Otherwise, they are the middle of the image. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
     """An image with its pose and the sparse points that it sees.
 
-    `points` (K,) are ascending indices of the model's points. `xy` (K, 2) are the keypoints that
-    see them, in undistorted pixels, those of the pinhole camera of `view`.
+    `points` (K,) are ascending indices of the model's points. `xy` (K, 2) are their keypoints in
+    this image, in undistorted pixels (of the pinhole camera of `view`).
     """
 
     view: PosedView
@@ -96,9 +88,8 @@ class RegisteredImage:
 class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
-    `images` are by name, in COLMAP's order. `points` (P, 3) are positions, `colors` (P, 3) uint8
-    sRGB, and `errors` (P,) the mean reprojection errors of points in pixels. `tracks` (P,) is the
-    number of images that see each point.
+    `images` are by name, in COLMAP's order. `points` (P, 3) have uint8 sRGB `colors` (P, 3) and
+    mean reprojection `errors` (P,) in pixels. `tracks` (P,) counts the images that see each point.
     """
 
     images: Mapping[str, RegisteredImage]
@@ -120,7 +111,7 @@ class SparseModel:
 
 
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
-    """Verify matched pairs by their two-view geometry, and store it in the database.
+    """Verify matched pairs by their two-view geometry, which is stored in the database.
 
     Returns the number of inliers of each pair that has at least `MIN_VERIFIED`.
     """
@@ -149,8 +140,8 @@ def map_images(
     """Estimate the poses of connected images one after the other, from verified pairs.
 
     With `known_cameras`, all intrinsics stay fixed. `registered` is called with the number of
-    images just added. Returns the largest `pycolmap.Reconstruction` and, for each other component
-    that was mapped, the names of its images.
+    images just added. Returns the largest `pycolmap.Reconstruction` and, for each smaller one, the
+    names of its images.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
@@ -182,8 +173,7 @@ def map_images(
             attempt = _sound(models, known_cameras)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
-            # The images left out may form a larger component. A folder may, for example, hold a
-            # clip of a drive and photographs of a house.
+            # The images left out may form a larger component, for example of another scene.
             mapped = frozenset[str]().union(*map(_names, found))
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
             if found and largest_component(left) <= _size(found[0]):
@@ -206,11 +196,9 @@ def map_globally(
 
 
 def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
-    """Return the models, largest first, without those whose estimated cameras are implausible.
+    """Return the models, largest first, without those where most estimated cameras are implausible.
 
-    A model is left out if more than half of its images have implausible cameras. With few points,
-    focal length and distortion may diverge until COLMAP can triangulate nothing in most images.
-    Known cameras cannot diverge, because they are fixed.
+    With few points, focal length and distortion may diverge until nothing can be triangulated.
     """
     limits = MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION
     found = []
@@ -225,8 +213,7 @@ def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
 def _largest(found: Sequence[Any], tried: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
     """Return the largest model, and the names of the images in each other model.
 
-    `found` are the sound models, largest first. If there are none, a NoDepthError says why: either
-    all models that were `tried` have implausible cameras, or the images do not overlap enough.
+    `found` are the sound models, largest first. If there are none, a NoDepthError says why.
     """
     if not found and any(_size(model) >= MIN_VIEWS for model in tried):
         raise NoDepthError(
@@ -277,10 +264,7 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
 
 
 def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> None:
-    """Bundle-adjust a model with a robust loss.
-
-    pycolmap's ready-made function is not used, because its log cannot be turned off.
-    """
+    """Bundle-adjust a model robustly. The log of pycolmap's own function cannot be turned off."""
     taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     enough = min(taken.values()) >= MIN_VIEWS_OF_PRINCIPAL_POINT
     with quiet_pycolmap() as pycolmap:
@@ -301,7 +285,7 @@ def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> Non
 
 
 def adjust_refined(model: Any, known_cameras: bool) -> None:
-    """Bundle-adjust a model with refined tracks twice. Remove wrong observations before each."""
+    """Twice remove wrong observations from a model with refined tracks, and bundle-adjust it."""
     for max_error_px, tolerance in (
         (MAX_VERIFICATION_ERROR_PX, ROUGH_TOLERANCE),
         (MAX_REFINED_ERROR_PX, TOLERANCE),

@@ -1,9 +1,8 @@
 """Find and correct images to which the mapping gave a wrong pose.
 
-An image that is registered early is placed by few points. If the camera moves straight ahead,
-wrong matches along its path agree with many places on the path, and the image may get a wrong one.
-It then stays there, because points whose depth comes from this image agree with the wrong place.
-Points whose depth comes from other images show the error.
+If the camera moves straight ahead, an image that is registered early, by few points, may get a
+wrong place on the path. It then stays there, because points whose depth comes from this image agree
+with the wrong place. Points whose depth comes from other images show the error.
 """
 
 from __future__ import annotations
@@ -22,23 +21,19 @@ from .colmap import quiet_pycolmap
 from .mapping import MAX_VERIFICATION_ERROR_PX, MIN_ANGLE_DEG, MIN_VERIFIED, adjust
 
 MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
-"""A point is used to test an image only if the lines of sight of the other images to this point
-spread about their mean by at least this angle (root mean square). If they spread less, the point
-got its depth from the tested image itself."""
+"""A point tests an image only if the other images' lines of sight to the point spread by this angle
+(root mean square). Otherwise, the point got its depth from the tested image itself."""
 
 MIN_GAIN = 1.5
-"""An image is moved to a new pose if the number of points that agree with the new pose is at least
-this multiple of the number that agree with the old pose. The ratio was within 1 % of 1 for images
-in their right place, and 3 or more for misplaced ones."""
+"""An image is moved if the number of points that agree with a pose grows at least by this factor.
+The factor was within 1 % of 1 for images in their right place, and 3 or more for misplaced ones."""
 
 MAX_ROUNDS = 3
-"""Images are checked in at most this number of rounds. After each round, the corrected images give
-better points for checking the other images."""
+"""Images are checked in at most this number of rounds: corrected ones then improve the points."""
 
 MIN_KEPT = 0.9
-"""All points are triangulated again after a correction. The correction is undone if the new points
-have less than this fraction of the observations that the old ones had. The fraction was 0.99 where
-a correction helped."""
+"""A correction is undone if less than this fraction of the observations is left when all points are
+triangulated again. The fraction was 0.99 where a correction helped."""
 
 
 def correct_places(
@@ -76,7 +71,7 @@ def correct_places(
 def _better_places(
     pycolmap: Any, model: Any, database: Path, seed: int, quiet: bool
 ) -> dict[int, Any]:
-    """Return better poses, by image number: with them, more points of other images agree."""
+    """Return, by image number, poses with which more points of other images agree."""
     how = pycolmap.AbsolutePoseEstimationOptions()
     how.ransac.max_error, how.ransac.random_seed = MAX_VERIFICATION_ERROR_PX, seed
     points, found = _Points(model), {}
@@ -135,7 +130,7 @@ class _Points:
         """Match the keypoints of an image to the points whose depth other images determine.
 
         `matches` are numbers of other images, each with (M, 2) indices of matching keypoints in
-        this image and in the other. Returns indices of keypoints, and those of their points.
+        this image and in the other image. Returns indices of keypoints and of their points.
         """
         own, sights = self._sights[number]
         counts, sums = self._counts.copy(), self._sums.copy()
@@ -154,7 +149,7 @@ class _Points:
 
 
 def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int, list[int]]:
-    """Return, for each image, the images with which it has verified matches, all by number."""
+    """Return, by image number, the numbers of the images with which it has verified matches."""
     partners = defaultdict[int, list[int]](list)
     for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair)

@@ -9,8 +9,8 @@ import numpy as np
 from ..batch.pair_list import Pair
 
 MIN_MATCHED = 0.5
-"""Two images are taken to show different things unless at least this fraction of the keypoints is
-matched, counted in the image that has fewer keypoints. Chosen by hand."""
+"""Two images may show the same things only if at least this fraction of the keypoints is matched,
+in the image that has fewer keypoints. Chosen by hand."""
 
 
 def largest_component(pairs: Sequence[Pair]) -> int:
@@ -26,9 +26,8 @@ def largest_component(pairs: Sequence[Pair]) -> int:
 def motion(first: np.ndarray, second: np.ndarray, matches: np.ndarray) -> float:
     """Return the median motion of matched keypoints in pixels, or infinity if few are matched.
 
-    `first` (N, 2) and `second` (M, 2) are the keypoints of two images in pixels, `matches` (K, 2)
-    indices of keypoints in the first and the second image. If there are few matches, most of them
-    may lie on something fixed to the camera, such as a car's bonnet or a time stamp.
+    `first` (N, 2) and `second` (M, 2) are keypoints in pixels, `matches` (K, 2) their indices. Few
+    matches may lie mostly on something fixed to the camera, such as a car's bonnet.
     """
     if len(matches) < MIN_MATCHED * min(len(first), len(second)):
         return np.inf
@@ -43,8 +42,7 @@ def thin_out(
     Args:
         names: all images in order.
         near: pairs of images that show nearly the same, with the motion between them in pixels.
-        dropped: images left out by earlier calls, each with the image that was kept in its place.
-            The images kept then are also kept in this call.
+        dropped: images left out earlier, each with the image kept in its place, which stays kept.
     """
     partners: dict[str, dict[str, float]] = {name: {} for name in names}
     for (first, second), distance in near.items():

@@ -200,10 +200,7 @@ def _usable_images(
     calibration: Camera | Calibration | str | Path | None,
     unregistered: dict[str, str],
 ) -> tuple[dict[str, tuple[int, int]], Mapping[str, Camera]]:
-    """Return the sizes of the images that can be used, and their cameras as far as known.
-
-    Adds every other image to `unregistered`, with the reason.
-    """
+    """Return the sizes and known cameras of usable images; add the others to `unregistered`."""
     for name, count in keypoints.items():
         if count < MIN_KEYPOINTS:
             unregistered[name] = (

@@ -33,8 +33,7 @@ class MultiViewReconstruction:
         unregistered: reasons why the other images are not registered, by name.
         components: groups of unregistered images that are connected with each other, as tuples of
             names, the largest group first. Each group can be reconstructed by itself.
-        reference: name of the image that sees most points. Its camera is the world frame unless
-            GPS or ground control points place the model.
+        reference: name of the image that sees most points.
         georeference: scale and place of the model, or a sentence on why they are unknown.
         sparse: points from which the poses were estimated.
         sparse_errors: (N,) float32 mean reprojection errors of these points in pixels.

@@ -25,25 +25,21 @@ SPLAT_POINTS = 200_000
 JPEG_QUALITY = 95
 
 CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
-"""A point covers a square in a depth map, whose side in pixels is one of `CELLS_PX`. It is the
-smallest side after which the next one increases the covered area by less than the factor
-`CLOSED_GAIN`, because few gaps are left then. Chosen by hand."""
+"""Points cover squares in a depth map, with the first side of `CELLS_PX` whose successor covers
+less than `CLOSED_GAIN` times the area: few gaps are left then. Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
 """A pixel of a depth map whose depth exceeds that of a neighbouring pixel by more than this
 fraction is left out: it is seen through a gap in a nearer surface. Chosen by hand."""
 
 DEPTH_PERCENT = 95.0
-"""The depths of this percentage of the sparse points, in each view, must fit into the 16 bits of a
-depth map."""
+"""The depths of this percentage of the sparse points in each view must fit into 16 bits."""
 
 MAX_VALUE_PER_UNIT = 1000.0
-"""Depth maps store depths in thousandths of the model's unit, such as millimetres, or in coarser
-steps if 16 bits are too few for that."""
+"""Depth maps store thousandths of the model's unit, or coarser steps if 16 bits are too few."""
 
 OPENGL = np.diag([1.0, -1, -1, 1])
-"""Transform from nerfstudio's camera axes (y up, z backward) to those of this package (y down, z
-forward)."""
+"""This maps nerfstudio's camera axes (y up, z backward) to this package's (y down, z forward)."""
 
 
 def write_transforms(
@@ -56,8 +52,8 @@ def write_transforms(
 ) -> None:
     """Write nerfstudio's transforms.json.
 
-    `files` gives files of each image, by their JSON key (such as "file_path") and by image name.
-    `points` is the file of the point cloud, and `more` are further values at the top level.
+    `files` maps a JSON key, such as "file_path", to the file of each image, by image name. `points`
+    is the file of the point cloud, and `more` are further values at the top level.
     """
 
     def relative(file: Path) -> str:

@@ -171,8 +171,7 @@ class Stages:
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
         """Return a folder that holds all images, and no results.
 
-        It is the given folder. For a list of files, or if the output folder is inside the given
-        one, it is a folder of links to the images.
+        For a list of files, or an output folder inside the given one, it holds links to the images.
         """
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
@@ -257,8 +256,7 @@ class Stages:
                 for pair, moved in motions.items()
                 if moved < limit * max(sizes[pair[0]]) and sizes[pair[0]] == sizes[pair[1]]
             }
-            # If pairs are chosen by similarity, all partners of an image may have been left out. So
-            # the pairs are chosen again.
+            # Pairs are chosen again, because all partners of an image may have been left out.
             if not (further := thin_out(names, near, dropped)):
                 return matches, dropped
             dropped |= further
@@ -321,8 +319,7 @@ class Stages:
             verified = {(a, b): count for a, b, count in noted["verified"]}
             components = [frozenset(names) for names in noted["components"]]
             return pycolmap.Reconstruction(sparse), verified, components
-        # A killed run may have left a log of its database. SQLite would take it for the log of the
-        # new database.
+        # SQLite would take the log of a killed run's database for that of the new database.
         for old in (*self.work.glob("mapping-*.json"), *self.output.glob("database.db-*")):
             old.unlink()
         with atomic_path(database) as path:

@@ -1,10 +1,9 @@
 """Refine tracks to sub-pixel accuracy: a patch of one image is aligned in all other images.
 
-Keypoints are detected in each image by itself, and noise and the viewing angle move them. Once the
-cameras are known, tracks can be refined. A patch is taken from the image that sees a point from the
-middle of all viewing directions. It is warped to the other images and aligned there. Lindenberger
-et al., "Pixel-Perfect Structure-from-Motion with Featuremetric Refinement", 2021, align features of
-a network instead of grey values.
+Noise and the viewing angle move the keypoints of each image. Once the cameras are known, a patch of
+the image that sees a point from the middle of all directions is warped to the other images and
+aligned there. Lindenberger et al., "Pixel-Perfect Structure-from-Motion with Featuremetric
+Refinement", 2021, align features of a network instead of grey values.
 """
 
 from __future__ import annotations
@@ -44,12 +43,10 @@ MAX_GROWTH = 7.0
 than this factor. Chosen by hand."""
 
 MIN_COMMON_POINTS = 10
-"""Patches of one image are aligned in another only if the two share at least this number of points.
-Chosen by hand."""
+"""Patches are aligned only between images that share this number of points. Chosen by hand."""
 
 DENSE_CELLS = 4500
-"""An image is divided into this number of grid cells, each of which begins at most one dense track.
-Chosen by hand."""
+"""Each of this number of grid cells of an image begins at most one dense track. Chosen by hand."""
 
 MIN_DISTANCE_PX = 3
 """A new track must begin farther than this from all earlier tracks in its image. Chosen by hand."""
@@ -58,9 +55,8 @@ MIN_DENSE_VIEWS = 3
 """A dense track needs at least this number of images: with two, no third one checks the match."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
-"""Images are cached, because successive images share neighbours. The cached images have at most
-`CACHED_PIXELS` pixels together, at seven bytes each. But at least `CACHED_IMAGES` are cached,
-whatever their size."""
+"""Images are cached, because successive images share neighbours: at least `CACHED_IMAGES`, and more
+if all have at most `CACHED_PIXELS` pixels together (of seven bytes each)."""
 
 
 class Surfaces(NamedTuple):
@@ -78,9 +74,8 @@ class Surfaces(NamedTuple):
 def refine_tracks(model: Any, folder: Path, quiet: bool = True) -> None:
     """Replace the tracks of a `pycolmap.Reconstruction` by refined ones. Cameras stay fixed.
 
-    The image that sees a point from the middle of its track gives the point's colour and a patch,
-    both at an integer pixel. The patch is aligned in the other images of the track. With `quiet`,
-    no progress bar is shown.
+    The image that sees a point from the middle of all directions gives the point's colour and a
+    patch to align in the other images of the track. With `quiet`, no progress bar is shown.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
@@ -96,10 +91,9 @@ def add_dense_tracks(
 ) -> None:
     """Add tracks of dense points to those of a model.
 
-    `fused` are views, each with the `DENSE_POINT` array of its depth map. Each image is divided
-    into a grid, and the best corner of each cell begins a track. A corner is left out if a track of
-    an earlier image is near and so matches it already. The model's own tracks are shorter than the
-    new ones. They are aligned again where no new track is near.
+    `fused` are views, each with the `DENSE_POINT` array of its depth map. The best corner in each
+    grid cell of an image begins a track, unless a track of an earlier image is near. The model's
+    own tracks, which are shorter, are aligned again where no new track is near.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
@@ -114,10 +108,10 @@ def add_dense_tracks(
 
 
 def _central_views(sparse: SparseModel) -> dict[str, tuple[Surfaces, np.ndarray]]:
-    """Return, by image, the points that this image sees best from the middle, and their indices.
+    """Return, by image, the points that it sees most centrally, and their indices.
 
-    The middle is the mean of all lines of sight to a point. The surface at the point is assumed to
-    face this direction.
+    The image nearest to the mean line of sight to a point sees it most centrally. The surface at
+    the point is assumed to face the mean direction.
     """
     images = [*sparse.images.values()]
     rows = np.concatenate([image.points for image in images])
@@ -179,9 +173,9 @@ class _Tracks:
     ) -> None:
         """Align patches of an image in other images, and turn them into points with tracks.
 
-        A patch becomes a point if it is found in at least `min_views` images, including its own.
-        Only images that share `MIN_COMMON_POINTS` with this image are searched. If `tracks` (K,)
-        gives the model's point of each patch, only the images that see this point are searched.
+        A patch becomes a point if at least `min_views` images show it, including its own. If
+        `tracks` (K,) gives each patch's point of the model, only images that see the point are
+        searched.
         """
         own = self.numbers[name]
         pixels, points, _ = wanted

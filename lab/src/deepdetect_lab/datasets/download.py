@@ -1,7 +1,6 @@
 """Download data sets, unpack them, and check them. Broken downloads can be resumed.
 
-This module uses `requests` instead of pooch, because pooch cannot resume a broken download. With
-the 19 GB of COCO, resuming is needed.
+Pooch is not used, because it cannot resume a broken download, such as the 19 GB of COCO.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
     *(errno.EMFILE, errno.ENFILE),
 )
-"""Error numbers that mean a problem of the disk or the system. While an archive is unpacked, all
-other errors mean that the archive is damaged."""
+"""Error numbers of the disk or system. Any other error in unpacking means a damaged archive."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,7 @@ class RemoteFile:
         size: approximate size in bytes.
         checksum: "md5:..." or "sha256:...". If it is None, only the contents of the finished data
             set are checked.
-        into: where the file belongs in the data set: for an archive, the folder to unpack it into;
-            for any other file, its path.
+        into: folder to unpack the archive into; for any other file, its path in the data set.
         inside: folder inside the archive, if any, whose contents are moved up into `into`.
         suffixes: endings of the files to unpack from a tar archive; empty for all files.
     """
@@ -78,8 +75,7 @@ class RemoteDataset:
         files: archives to unpack, and single files.
         images: number of images.
         licence: the terms of use.
-        contents: digests of files (see `content_digest`), by path of the file in the data set. The
-            digests do not depend on the archive or the image format.
+        contents: digests of files (see `content_digest`), by path in the data set.
         texts: contents of text files to write, by path in the data set.
         prepare: function that converts the unpacked files in a folder to the data set. Its second
             argument says whether progress bars are off.

@@ -50,7 +50,7 @@ class CalibratedStereoPair(StereoPair):
 
 
 def load_middlebury(folder: str | Path) -> StereoPair:
-    """Load a scene and its true disparity map, which is upscaled if the images are larger."""
+    """Load a scene and its true disparity map, which is upscaled to the size of the images."""
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
@@ -71,7 +71,6 @@ def load_middlebury(folder: str | Path) -> StereoPair:
             f"the ground truth {file} must be a grey image with a value_per_pixel above 0"
         )
     disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
-    # If the map is smaller than the images, it is upscaled by nearest neighbours.
     size = (left.shape[1], left.shape[0])
     disparity = np.asarray(Image.fromarray(disparity).resize(size, Image.Resampling.NEAREST))
     return StereoPair(root.name, left, right, disparity)

@@ -11,8 +11,7 @@ Item = TypeVar("Item")
 
 
 FRAME_DISTANCES = (1, 3, 5, 10, 15, 20)
-"""The two images of a pair from a sequence are one of these numbers of frames apart. Chosen by
-hand; not measured."""
+"""Images of a sequence are paired at these distances in frames. Chosen by hand; not measured."""
 
 
 def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:

@@ -32,18 +32,15 @@ from .download import RemoteFile
 
 CROP_SIDE_PX = 480
 JPEG_QUALITY = 97
-"""Labels hardly change at this JPEG quality, because compression errors are smaller than image
-noise."""
+"""Labels hardly change at this JPEG quality: compression errors are smaller than image noise."""
 
 VALIDATION_SHARE = 1 / 20
 
 FREE_LICENCES = ("CC0", "CC BY", "CC BY-SA", "Unsplash")
-"""Names of licences that allow any use, including that of weights trained on the images, begin with
-these."""
+"""Licences whose names begin with these allow any use, also of weights trained on the images."""
 
 RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECASE)
-"""Words for restrictions (non-commercial, no derivatives) in names of licences. Such a licence is
-not free even if its name begins like that of a free one."""
+"""Licences with these words in their names restrict use, however the names begin."""
 
 LICENCES_FILE = "licences.csv"
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")

@@ -34,8 +34,7 @@ NOT_IN_D2NET_SUBSET = {
     *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
     *("v_artisans", "v_astronautis", "v_talent"),
 }
-"""HPatches scenes with images larger than 1600x1200 pixels. Most papers, for example D2-Net's,
-leave these scenes out."""
+"""HPatches scenes with images above 1600x1200, which most papers, such as D2-Net's, leave out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +72,7 @@ class PlanarScene:
         return [self.pairs[0].first, *(pair.second for pair in self.pairs)]
 
     def with_max_pairs(self, max_pairs: int) -> PlanarScene:
-        """Return the scene with at most `max_pairs` evenly spaced pairs. If 1, it is the last."""
+        """Return the scene with at most `max_pairs` evenly spaced pairs, for 1 the last pair."""
         kept = self.pairs[-1:] if max_pairs == 1 else evenly_spaced(self.pairs, max_pairs)
         return replace(self, pairs=tuple(kept))
 

@@ -30,12 +30,10 @@ from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 MAX_ROTATION_ERROR = 1e-3
-"""The product of a rotation matrix and its transpose may differ from the identity by this value,
-since files have few digits."""
+"""Tolerance for R R^T = I in rotation matrices R that were read, since files have few digits."""
 
 MAX_ASPECT_ERROR = 0.01
-"""The aspect ratio of an image may differ from that of its camera by this fraction, since sizes are
-rounded to pixels."""
+"""Image and camera may differ by this fraction in aspect ratio, since sizes are rounded."""
 
 COLMAP_FILES = ("images.bin", "images.txt")
 

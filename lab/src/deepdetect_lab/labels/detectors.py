@@ -21,20 +21,17 @@ from deepdetect._shared.opencv import cv2, opencv_factory
 Value = bool | int | float
 Settings = Mapping[str, Any]
 Range = tuple[float, float] | range
-"""The allowed values of a setting: a tuple of the smallest and the largest one, or a range of all
-allowed integers."""
+"""Allowed values of a setting: a tuple (smallest, largest), or a range of all allowed integers."""
 
 AGAST_OAST_9_16 = 3
 """The value of `AgastFeatureDetector::OAST_9_16`, which some OpenCV versions do not export."""
 
-# Outside these ranges OpenCV crashes, runs for minutes, wraps values (modulo 256), or raises an
-# error.
+# Outside these ranges, OpenCV crashes, runs for minutes, wraps values modulo 256, or fails.
 GRAY_LEVELS = (0, 255)
 BLOCK_SIZES = (1, 255)
 KERNEL_SIZES = range(1, 32, 2)
 CANNY_THRESHOLDS = (0, 2040)
-"""Allowed range of Canny's two thresholds. They apply to the sum of the absolute x and y gradients
-of the 3x3 Sobel filter, which lies in this range for 8-bit images."""
+"""Allowed range of Canny's thresholds: that of |dx| + |dy| of 3x3 Sobel filters on 8-bit images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,15 +110,14 @@ def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
 def _brisk_detector(threshold: int, octaves: int) -> cv2.Feature2D:
     """Make a BRISK detector, or return the one made for earlier images.
 
-    In a dark image, computing its sampling pattern would take as long as detection.
+    In a dark image, computing BRISK's sampling pattern would take as long as detection.
     """
     return opencv_factory("BRISK_create")(thresh=threshold, octaves=octaves)
 
 
 def _brisk(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect AGAST corners in a scale space (Leutenegger et al., 2011)."""
-    # The number of octaves is limited, because OpenCV fails on layers smaller than a pixel. The
-    # smaller layer of an octave has 2/3 of the octave's size.
+    # OpenCV fails on layers smaller than a pixel. An octave's smaller layer has 2/3 of its size.
     most = (2 * min(gray.shape) // 3).bit_length()
     return _marked(gray, _brisk_detector(settings["threshold"], min(settings["octaves"], most)))
 

@@ -26,8 +26,7 @@ from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
 
 LOW_VISIBILITY_RANGE = 64
-"""An image has low visibility if its luma spans fewer grey levels than this. The docstring of
-`visibility_of` gives measurements."""
+"""An image has low visibility if its luma spans fewer grey levels; `visibility_of` says why."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -29,15 +29,13 @@ class LabelOptions:
 
     Attributes:
         detectors: names of the detectors to fuse (default: all nine).
-        visibility: which settings to use, those for "normal" or for "low" visibility. "auto" uses
-            those for "low" if the image's luma spans fewer than 64 grey levels from the 1st to the
-            99th percentile.
+        visibility: which settings to use, those for "normal" or for "low" visibility. "auto"
+            chooses them for each image by `visibility_of`.
         settings: settings that differ from the paper's, by detector and then by section, which is
             "normal" or "low_visibility".
 
     Raises:
-        OptionError: a name is unknown (the message gives the nearest known name), or a value has
-            the wrong type or is out of its range.
+        OptionError: a name is unknown, or a value has the wrong type or is out of its range.
 
     Example:
         >>> LabelOptions(settings={"fast": {"normal": {"threshold": 20}}}).visibility
@@ -113,8 +111,7 @@ def _checked_value(detector: str, name: str, value: Any) -> Value:
 
 LABEL_SETTINGS: dict[str, LabelOptions] = {
     "paper": LabelOptions(),
-    # Denser labels suit geometric tasks. The number of correct stereo matches decided on this value
-    # (docs/training.md).
+    # This value gave most correct stereo matches: denser labels suit geometry (docs/training.md).
     "dense": LabelOptions(settings={"sobel": {"normal": {"relative_threshold": 0.02}}}),
 }
 

@@ -33,8 +33,7 @@ OPSET = 17
 """Version of the ONNX operator set. ONNX Runtime 1.24, OpenVINO and OpenCV 4 can all read it."""
 
 _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
-"""Batch normalisation is folded into a kernel by one factor per output channel. This is the shape
-in which the factors multiply the kernel, by type of convolution."""
+"""Shape of batch normalisation's factors that multiply a kernel, by type of convolution."""
 
 
 def to_onnx(
@@ -46,7 +45,7 @@ def to_onnx(
 ) -> onnx.ModelProto:
     """Convert a network to ONNX by tracing it with example `inputs`, which are given by name.
 
-    `axes` names the axes of variable size, by input or output and by number of the axis.
+    `axes` maps each input or output to the names of its axes of variable size, by axis number.
     """
     written = io.BytesIO()
     with warnings.catch_warnings():
@@ -84,7 +83,7 @@ def export_onnx(network: nn.Module, path: str | Path) -> None:
 
 
 def add_padding(model: ModelProto) -> None:
-    """Extend a network from `image` to `logits`: accept any size, and also output probabilities.
+    """Extend a network that maps `image` to `logits`: accept any size, also output probabilities.
 
     As in `compute_maps`, the last row and column of the image are repeated until its sides are
     multiples of 8, and the maps are cropped to the size of the image. Probabilities are clipped to
@@ -116,9 +115,9 @@ def add_padding(model: ModelProto) -> None:
 def fold_normalisation(graph: GraphProto) -> None:
     """Fold each batch normalisation into the convolution before it.
 
-    If there is no convolution before it, it becomes a factor and an offset. The folding is computed
-    in float64, so that the same weights give the same numbers everywhere: PyTorch's exporter rounds
-    differently on different processors. The convolutions must not have a bias yet.
+    Without a convolution before it, a normalisation becomes a factor and an offset. Folding uses
+    float64, because PyTorch's exporter rounds differently on different processors. The convolutions
+    must not have a bias yet.
     """
     values = {one.name: one for one in graph.initializer}
     made = {name: node for node in graph.node for name in node.output}

@@ -20,8 +20,7 @@ from torch.nn.functional import (
 )
 
 HALF, QUARTER, EIGHTH = 16, 32, 40
-"""Numbers of channels at 1/2, 1/4 and 1/8 of the image size. The number at 1/2 is the smallest,
-because the layers there take most time."""
+"""Numbers of channels at 1/2, 1/4 and 1/8 of the image size: fewest where layers take most time."""
 
 RED, GREEN, BLUE = 9798, 19235, 3735
 """Weights of red, green and blue in the luma (BT.601), in units of 1/32,768, as in OpenCV."""
@@ -129,8 +128,7 @@ class FastNetwork(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""
-        # Autocast would round the luma. But a difference of one grey level matters, because it is
-        # the smallest threshold of the label detectors.
+        # Autocast would round the luma, but the detectors' least threshold is one grey level.
         with torch.autocast(image.device.type, enabled=False):
             luma = self.luma(image)
             exposure, mean = self.exposure(luma)

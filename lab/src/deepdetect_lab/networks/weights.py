@@ -27,8 +27,7 @@ H and W are multiples of `STRIDE`. To add a network, write a module in this pack
 
 
 FOLDER = Path(__file__).parents[1] / "weights"
-"""Folder of trained weights from which training can start. The package `deepdetect` has the same
-weights in ONNX files."""
+"""Folder of trained weights to start training from; `deepdetect` has the same in ONNX files."""
 
 
 def find_weights(weights: str | Path) -> Path:
