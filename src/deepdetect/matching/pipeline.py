@@ -35,7 +35,7 @@ from .guided.tentative_matches import checked_positions
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
 """The stages that `match_images` reports. "initial geometry" is reported only for a `DeepDetect`
-without masks; for other detectors, it is part of "guided matching"."""
+without masks; otherwise the initial geometry is part of "guided matching"."""
 
 MAX_RETURN_ERROR_PX = 2.0
 """If `mutual`, a match is kept only if the reverse match that starts nearest to its end leads back

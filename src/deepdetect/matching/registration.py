@@ -40,7 +40,8 @@ measure how well unrelated content correlates. Chosen by hand."""
 
 MIN_DEVIATIONS = 4.0
 """Two images agree if their correlation exceeds the mean of shifted copies (`SHIFTS`) by this many
-standard deviations: by 9 to 70 within each Oxford scene (1-4, 1-6), by 1.8 between two scenes."""
+standard deviations. It does by 9 to 70 for images 1 and 4, or 1 and 6, of an Oxford scene, and by
+1.8 for images of different scenes."""
 
 COMPARED_SIDE_PX = 480
 """Images are reduced to this longer side before they are compared. Chosen by hand."""

@@ -96,7 +96,8 @@ def simulate_view(
 
 
 def _fitting(gray: np.ndarray, linear: np.ndarray) -> tuple[tuple[int, int], np.ndarray]:
-    """Return the size that holds a linearly mapped image, and the map with the shift it needs."""
+    """Return the size of a linearly mapped image, and the affine map that moves it to the
+    origin."""
     height, width = gray.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ linear.T
     low = corners.min(0)

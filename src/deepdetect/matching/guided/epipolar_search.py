@@ -26,8 +26,8 @@ MAX_RATIO_NEAR = 0.85
 """Maximum ratio in the ratio test among the keypoints near an epipolar line. Chosen by hand."""
 
 MIN_SEPARATION_PX = 5.0
-"""The ratio test near the line ignores keypoints closer than this to the best match, because they
-show the same place. Chosen by hand."""
+"""The ratio test near the line ignores keypoints closer than this to the best match, because these
+keypoints show the same place. Chosen by hand."""
 
 NULL_SHIFTS = (0.05, 0.1)
 """Chance matches are counted along epipolar lines shifted by these fractions of the longer side of
@@ -37,7 +37,7 @@ the second image. Chosen by hand."""
 def epipolar_search(
     first: Keypoints, second: Keypoints, fundamental: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match keypoints that are most similar to each other near their epipolar lines, one to one.
+    """Match keypoints one to one by their descriptors, only near each other's epipolar lines.
 
     Returns the positions of the matches, (M, 2) float64 in each image.
     """
@@ -83,7 +83,7 @@ def _nearest_on_lines(distances, ones0, lines1, ones1, lines0, max_distance, sep
 
     Returns, for each keypoint of the first image, the index of its partner and three squared
     descriptor distances: to the partner, to the best other keypoint near the line, and to the best
-    one far from it. For the second image, returns the partners and the last of these distances.
+    one far from it. For the second image, returns partners and distances far from the lines.
     """
     count0, count1 = distances.shape
     partner0, partner1 = np.zeros(count0, np.int64), np.zeros(count1, np.int64)
@@ -132,8 +132,8 @@ def log10_p_value(
     """Return the log10 of the probability that chance explains the new matches on epipolar lines.
 
     Matches are new unless their positions in the first image are in `used`, the (M, 2) positions
-    from which the matrix was estimated. Matches on shifted lines arise by chance. Their mean number
-    is the mean of a Poisson distribution, which gives the probability.
+    from which the fundamental matrix was estimated. Matches on shifted lines arise by chance. Their
+    mean number, as the mean of a Poisson distribution, gives the probability.
     """
     distances = _squared_distances(first, second)
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}

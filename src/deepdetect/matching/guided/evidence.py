@@ -40,7 +40,8 @@ from ...geometry.transforms import (
 from .tentative_matches import Pair
 
 COMPARED_SIDE_PX = 320
-"""Images are reduced to this longer side to compare shifts; periods of patterns stay long."""
+"""Images are reduced to this longer side before shifts are compared. This is enough, because the
+periods of patterns are many pixels long."""
 
 MIN_SHIFT_PX = 10
 """Shorter shifts of the reduced images are ignored, because aligned images correlate there."""
@@ -96,8 +97,8 @@ NEIGHBOURS = 8
 
 MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
 """The steps from a match to a neighbour in both images give a rotation and a scale: one complex
-number. Two numbers agree if they differ by less than the first value times their magnitude (tilt,
-depth) plus the second value (position errors) over the length of the step. Chosen by hand."""
+number. Two numbers agree if they differ by less than the first value times their magnitude, for
+tilt and depth, plus the second value, for position errors, over the step length. Chosen by hand."""
 
 
 def is_repeated(
@@ -156,7 +157,7 @@ def is_repeated(
 def _parallax_decides(
     first: np.ndarray, scale0: float, sparse: Pair, plane: np.ndarray, copy: np.ndarray, seed: int
 ) -> bool:
-    """Return whether matches off the plane agree on an epipole relative to it, not to its copy."""
+    """Return whether matches off `plane` agree on an epipole relative to it, but not to `copy`."""
     points0, points1 = sparse
     on_plane = transform_points(points1, np.linalg.inv(plane))
     starts, ends = (scaled_points(points, scale0) for points in (points0, on_plane))

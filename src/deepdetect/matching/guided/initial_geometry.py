@@ -48,9 +48,8 @@ COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
 """Longer side in pixels and maximum keypoints in the coarse pass. Chosen on Oxford and others."""
 
 MIN_COARSE_INLIERS = 50
-"""The coarse pass is used if a homography has at least this many inliers; the caller's keypoints
-are used if any model has as many. If SIFT on larger copies has fewer, learned descriptors are
-tried."""
+"""The coarse pass is used if a homography has at least this many inliers, the caller's keypoints if
+any model has. If SIFT on larger copies gives fewer inliers, learned descriptors are tried."""
 
 MIN_COARSE_DEPTH_INLIERS = 200
 """Minimum inliers of a fundamental matrix in the coarse pass. Chosen on Oxford and others."""
@@ -67,7 +66,7 @@ WINDOW_PX = 16
 
 MIN_GAIN = 1.2
 """Images are from two sensors if cross-modal descriptors give at least this many times the matches
-of learned ones: 1.5 to 30 times for visible and infrared light, up to 1.17 for photographs."""
+of learned descriptors: 1.5 to 30 for visible and infrared light, up to 1.17 for photographs."""
 
 MIN_INVERTED = 0.05
 """Images are also from two sensors if at least this fraction of the inliers is dark in one image
@@ -80,7 +79,7 @@ Unrelated photographs reach -8 with learned descriptors. With cross-modal ones, 
 pixels reaches -20, and visible and infrared light have -24 or less."""
 
 MAX_MATCHES_TO_SEARCH = 200
-"""If a fundamental matrix has fewer inliers than this, more are searched along its lines."""
+"""If a fundamental matrix has fewer inliers, more are searched along its epipolar lines."""
 
 MAX_HINT_LOG10_NFA = 0.0
 """If an untrusted geometry has a log10 number of false alarms below this, it may be more than
@@ -215,9 +214,9 @@ def _geometry_of_keypoints(
 def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     """Find the geometry from keypoints with learned descriptors, or cross-modal ones if needed.
 
-    In different light, in the dark, under blur or from another side, these have two to fifteen
-    times the inliers of SIFT. SIFT's positions are more exact, which helps to tell depth from a
-    plane.
+    In different light, in the dark, under blur or from another side, these keypoints have two to
+    fifteen times the inliers of SIFT. SIFT's positions are more exact, which helps to tell depth
+    from a plane.
     """
     as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
     seen = as_it_is.views, as_it_is.features
@@ -233,7 +232,7 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
 
 
 def _is_inverted(tentative: TentativeMatches, geometry: InitialGeometry) -> bool:
-    """Return whether `MIN_INVERTED` of the inliers are dark in one image, bright in the other."""
+    """Return whether enough inliers (`MIN_INVERTED`) are dark in one image, bright in the other."""
     scale0, scale1 = tentative.scales
     agreeing = scaled_points(geometry.points0, scale0), scaled_points(geometry.points1, scale1)
     correlations = zncc_at_points(tentative.views, agreeing, WINDOW_PX)

@@ -105,7 +105,7 @@ up to a tenth of the matches is verified."""
 
 MAX_DISTANCE_PX = 1.0
 """A keypoint of the second image may be a partner if it is nearer than this to the place where the
-homography maps the first keypoint. Chosen by hand."""
+homography maps the keypoint of the first image. Chosen by hand."""
 
 MIN_PROPOSED_FRACTION = 0.25
 """If fewer than this fraction of the visible keypoints have a partner under the homography, the
@@ -122,7 +122,7 @@ MAX_SCALE_RATIO = 1.5
 while the homography is refined, because corners of different scales lie at different places."""
 
 MIN_SCALE = 1 / 16
-"""Minimum scale of the reduced finer image. If scales differ more, nothing can be refined."""
+"""The finer image is reduced at most to this scale. If scales differ more, refinement fails."""
 
 
 def guided_matches(
@@ -232,8 +232,7 @@ def _plane_or_depth(
             yield apart, None
         yield joint, matrix if planar else None
         if not planar and first.others:
-            # If something moves on its own, the matches off the plane alone may give a better
-            # matrix.
+            # If something moves, the matches off the plane alone may give a better matrix.
             yield guiding_geometry(grays, "fundamental", seed, first.others), None
 
     depth, geometry, matches = _first_that_matches(grays, pixels[0], ways(), enough)

@@ -63,8 +63,8 @@ MIN_CORRELATION = 0.3
 allows a lower correlation."""
 
 FALSE_POSITIVE_RATE = 0.01
-"""A second minimum of the correlation is set so that at most this fraction of the pixels matches by
-chance, as measured on unrelated rows. Chosen on Oxford and others."""
+"""Besides `MIN_CORRELATION`, a second minimum of the correlation lets at most this fraction of the
+pixels match by chance, as measured on unrelated rows. Chosen on Oxford and others."""
 
 FALSE_DISCOVERY_RATE = 0.01
 """Matches below the minimum correlations are kept as well, but geometry does not rely on them, if
@@ -82,13 +82,13 @@ MAX_RANGE_EXCESS = 1.25
 the range of the disparities found. Chosen on Oxford and others."""
 
 MIN_SIGMA_PX = 0.1
-"""Minimum sigma that is assumed for tracks and for sparse matches. Chosen on Oxford and others."""
+"""Minimum assumed sigma of the errors of tracks and sparse matches. Chosen on Oxford and others."""
 
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 """Maximum number of tracked corners, and side of their windows. Chosen on Oxford and others."""
 
 MAX_TRACK_PX = 4.0
-"""Maximum distance of a track's end from the match of the rows. Chosen on Oxford and others."""
+"""Maximum distance of a track's end from the match on its row. Chosen on Oxford and others."""
 
 MIN_TRACKS = 50
 """A pair with fewer tracked corners gets no dense matches. Chosen on Oxford and others."""
@@ -216,7 +216,7 @@ def rectified_view(
     seen = None if isinstance(frame, PolarFrame) else find_disparity_range(first, second)
     if seen is not None:
         widened = min(low, seen[0]), max(high, seen[1])
-        # The range of the small copy may be far off. It is used only if this size can be searched.
+        # This range may be far off. It is used only if images of this size can be searched over it.
         if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
             low, high = widened
     widest = frame.size[0] - 1
@@ -224,7 +224,7 @@ def rectified_view(
     if searched[0] >= searched[1]:
         return None
     disparity, matched, correlation = _match_rows((first, second), (valid0, valid1), searched)
-    # Some rows are matched with unrelated rows of the second view, where all matches are chance.
+    # Some rows are matched with unrelated rows of the second view: all these matches are chance.
     height = len(first)
     count = max(1, round(height * NULL_FRACTION))
     rows = (height - count) // 2 + np.arange(count)
@@ -270,7 +270,7 @@ def _correlation_bounds(
     null = np.sort(null)[::-1]
     allowed = int(FALSE_POSITIVE_RATE * null_pixels)
     high = max(MIN_CORRELATION, float(null[allowed]) if len(null) > allowed else -1.0)
-    # If chance gives hardly any matches and the pair many, those of low correlation are credible.
+    # Matches of low correlation are credible if chance gives hardly any matches and the pair many.
     ordered = np.sort(correlations)
     bounds = np.append(-1.0, null[::-1])
     matches = len(ordered) - np.searchsorted(ordered, bounds)
@@ -305,7 +305,7 @@ def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
     """Track corners to the second view, starting from the matches of the rows.
 
     Returns the corners in both images at full size, and the ends of their tracks moved to the rows
-    where they start, as row matching assumes; None with fewer than `MIN_TRACKS` tracks.
+    where the tracks start, as row matching assumes; None with fewer than `MIN_TRACKS` tracks.
     """
     first, second = (equalise(gray) for gray in view.views)
     mask = view.relied.astype(np.uint8)
@@ -344,7 +344,7 @@ def _refine(
 def _agreement(view: RectifiedView, sparse: Pair) -> float:
     """Return the fraction of sparse matches that agree with the disparity where they start.
 
-    Only sparse matches that start where geometry relies on the disparity count. If most of these
+    Matches that start where geometry relies on no disparity are left out. If most of the others
     disagree, rows were matched to similar but wrong places.
     """
     positions = [view.to_frame(points, side) for side, points in enumerate(sparse)]

@@ -3,9 +3,9 @@
 The second image is warped into the frame of the first. At each point, SIFT descriptors of both
 images, in two sizes, are compared by their correlation, after the mean of all descriptors is
 subtracted. Null pairs are unrelated patches, from a warped image that is shifted by a third of its
-size or more. A point passes if its distance, averaged over its neighbours, is below that of nearly
-all null pairs, and if most points around it pass. To save time, descriptors are computed only at
-the points of a lattice that are nearest to the keypoints.
+size or more. A point passes if its distance (1 - correlation), averaged over its neighbours, is
+below that of nearly all null pairs, and if most points around it pass. To save time, descriptors
+are computed only at the points of a lattice that are nearest to the keypoints.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ NULL_SHIFTS = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shifts between the patches of a null pair, as fractions of width and height."""
 
 NULL_BLOCK_PX = 64
-"""Null pairs are taken from blocks of the image with this side. Chosen by hand."""
+"""Null pairs come from whole blocks of this side: neighbours are averaged. Chosen by hand."""
 
 MAX_NULL_BLOCKS = 256
 """Maximum number of random blocks per shift. Images of up to a megapixel have no more blocks."""
@@ -122,7 +122,7 @@ def sample_null_pairs(
     `points` are the (N, 2) described points; for the other arguments see `dissimilarity`.
     """
     size = np.array(warped.shape[::-1])
-    # All shifts are multiples of the lattice step, so one descriptor serves most of them.
+    # Shifts by multiples of the lattice step keep most partners on the lattice of descriptors.
     step = LATTICE_PX
     period = np.maximum(size // step, 1) * step
     rows_and_columns = [np.arange(length) for length in warped.shape]
@@ -195,7 +195,7 @@ def _lattice_near(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
 
 
 def _sample_blocks(pixels: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Return for each shift the points in random blocks, which are whole to average neighbours."""
+    """Return, for each shift, the indices of the points in randomly chosen blocks."""
     block = pixels // NULL_BLOCK_PX
     number = block[:, 1] * 1_000_000 + block[:, 0]
     order = np.random.default_rng(seed).permutation(np.unique(number))

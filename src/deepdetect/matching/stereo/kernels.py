@@ -274,8 +274,7 @@ def step_rows(  # type: ignore[no-untyped-def]
     In each window, gain * (values - change * slopes) + offset is fitted to the left grey values,
     and `change` is added to the disparity. Only pixels whose disparity differs from the centre's by
     at most `max_difference` are used. All inputs are padded by `radius`; `sample_rows` gives
-    `values` and `slopes`. Slopes below `noise` damp the change. It is 0 if the gain is below
-    `min_gain`.
+    `values` and `slopes`. Slopes below `noise` damp the change; a gain below `min_gain` makes it 0.
     """
     width = out.shape[1]
     n, p, v, s, vv, ss, vs, pv, ps = np.empty((9, BLOCK), np.float32)
@@ -287,8 +286,7 @@ def step_rows(  # type: ignore[no-untyped-def]
             # The grey level of the centre is subtracted: sums stay small and exact.
             middle = left[row, column : column + count]
             other = values[row, column : column + count]
-            # Sums over the window: pixels (n), left and right grey (p, v), slopes (s), and
-            # products.
+            # Sums over the window: count (n), left and right grey (p, v), slope (s), products.
             for total in (n, p, v, s, vv, ss, vs, pv, ps):
                 total[:] = 0
             for j in range(-radius, radius + 1):

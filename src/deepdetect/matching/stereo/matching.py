@@ -30,7 +30,8 @@ MAX_SPECKLE_AREA_PX = 100
 """Isolated patches of one surface with at most this many pixels are dropped. Chosen by hand."""
 
 SPECKLE_SUBDIVISIONS = 4
-"""Steps per pixel in OpenCV's speckle filter, which needs integers. Chosen by hand."""
+"""Disparities are rounded to this many steps per pixel, because OpenCV's speckle filter needs
+integers. Chosen by hand."""
 
 BORDER_PX = 4
 """Matches this near to the left or the right border of the right image are dropped, because windows
@@ -46,16 +47,15 @@ difference of disparity, because windows reach over both ends of the gap."""
 MIN_SUPPORT_PX = 5
 """Lines that extrapolate a surface are fitted to at least this many pixels. Chosen by hand."""
 
-# If no range of disparities is given, it is searched on a copy of this width, without patches of at
-# most this area. The range then just covers the Motorcycle pair and the Middlebury scenes of the
-# benchmark.
+# If no range is given, it is searched on a copy of this width, without patches up to this area. The
+# range then just covers the Motorcycle pair and the Middlebury scenes of the benchmark.
 SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX = 160, 50
 SEARCH_UNIQUENESS_RATIO = 1.3
 """Any other match on the row of the small copy must cost at least this many times as much as the
 best match. False matches rarely reach this ratio."""
 
 TAIL_FRACTION = 0.01
-"""This fraction of disparities at each end of their range is ignored as wrong. Chosen by hand."""
+"""This fraction of disparities at each end of the range counts as unreliable. Chosen by hand."""
 
 SEARCH_MARGIN_PX = 1.5
 SEARCH_MARGIN_FRACTION = 0.2
@@ -75,13 +75,13 @@ class DisparityOptions:
             divided by the cost of its own match, is at least this.
         discontinuity_margin_px: disparities within this distance of a disparity discontinuity are
             dropped, because windows reach that far and give pixels beside a near object the
-            disparity of the object. Objects up to twice as wide vanish. 0 drops nothing.
+            disparity of the object. Objects up to twice as wide as this vanish. 0 drops nothing.
         fill_occlusions: whether pixels that the right image does not show get the disparity of the
-            surface next to them. In a gap between two surfaces, this is the farther surface if row
-            and column of the pixel agree. Outside the right image, the first visible surface is
-            extrapolated along a line, as far as the line can be trusted. Filled pixels have no
-            match (`DisparityMap.matched`). The outermost pixels of nearer surfaces are dropped,
-            because they often belong to the farther surface.
+            surface next to them. In a gap between two surfaces, this is the farther surface, if
+            filling along the row and along the column agree. Outside the right image, the first
+            visible surface is extrapolated along a line, as far as the line can be trusted. Filled
+            pixels have no match (`DisparityMap.matched`). The outermost pixels of nearer surfaces
+            are dropped, because they often belong to the farther surface.
 
     Raises:
         OptionError: a value is out of its range.
@@ -184,11 +184,12 @@ def disparity_map(
 
     The method is semi-global matching of census transforms. A disparity is kept if both views
     agree, no other place on the row is as good, and it is neither in a small isolated patch nor
-    near a disparity discontinuity. It is then refined to sub-pixel accuracy. The light may differ
-    between the views. `reconstruct` samples this map at the keypoints of rectified pairs.
+    near a disparity discontinuity. Kept disparities are refined to sub-pixel accuracy. The light
+    may differ between the views. For rectified pairs, `reconstruct` samples this map.
 
     Args:
-        image0, image1: left and right image of one size, anything `load_image` takes, as luma.
+        image0, image1: the left and the right image, of the same size, in any form that
+            `load_image` accepts; only their luma is used.
         options: how disparities are found, and which are kept; `DENSE` keeps as many as possible.
         channels: order of the colours in arrays: "rgb", or "bgr" as in OpenCV.
 
@@ -308,7 +309,7 @@ def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) 
 def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
     """Return which pixels are within `distance_px` of a disparity discontinuity, (H, W) bool.
 
-    Unknown pixels count as part of the farther surface on both sides of their row.
+    Unknown pixels count as part of the farther of the known surfaces left and right of them.
     """
     filled = fill_occlusions(disparity, known)[0]
     beside = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -320,7 +321,7 @@ def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: in
 def on_occluding_edge(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
     """Return which known pixels of nearer surfaces are within `distance_px` of a farther one.
 
-    Unknown pixels count as part of the farther surface beside them.
+    Unknown pixels count as part of the farther of the known surfaces left and right of them.
     """
     filled = fill_occlusions(disparity, known)[0]
     farthest = cv2.erode(filled, _square(distance_px))

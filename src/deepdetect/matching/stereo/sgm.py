@@ -72,7 +72,7 @@ SMOOTHING_RADIUS_PX = 4
 iteration of the fit, to reduce the bias of the parabola."""
 
 FINAL_SMOOTHING_RADIUS_PX = 2
-"""Radius of the window in which disparities are averaged after the last iteration."""
+"""Radius of the window of the average over disparities after the last iteration of the fit."""
 
 ITERATIONS = 2
 """Number of iterations of the fit of the grey values."""

@@ -26,8 +26,8 @@ HUBER_THRESHOLD_PX = 2.0
 """Huber's loss reduces the weight of residuals above this. Chosen by hand; not measured."""
 
 FOCAL_LENGTHS = np.geomspace(0.3, 10, 100) * 640 / UNIT_PX
-"""Start focal lengths in units of the fit: 0.3 to 10 times 640 px, the default registration
-side."""
+"""Start values of the focal length in units of the fit: 0.3 to 10 times 640 px, the default longer
+side of the images for registration."""
 
 FOCAL_WEIGHT = 1e-4
 """Weight of the term that keeps all focal lengths equal: a difference of 10 % costs as much as a

@@ -143,7 +143,7 @@ def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
 
 
 def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, float] | None:
-    """Return the mean brightness of both images in their overlap; None if it is too small."""
+    """Return the mean brightness of both images in their overlap; None for small overlaps."""
     parts = _overlap(first, second)
     shared = (first.mask[parts[0]] > 0) & (second.mask[parts[1]] > 0)
     if np.count_nonzero(shared) < MIN_OVERLAP_PX:

@@ -71,7 +71,7 @@ class Panorama:
         gains: brightness factor of each image.
         seconds: time of each stage, by its name.
         parallax: displacement along the seam in panorama pixels, by the numbers of both images, for
-            pairs where it is visible because the camera moved.
+            pairs where it is visible because the camera moved between them.
         closed: whether the panorama shows 360 degrees, and its right border continues at the left.
     """
 

@@ -31,7 +31,7 @@ SIFT_KEYPOINTS = 2000
 """Number of sparse keypoints per image to find overlaps. Chosen by hand; not measured."""
 
 MAX_KEYPOINTS = 30_000
-"""A homography is confirmed by at most this many dense keypoints per image. Chosen by hand."""
+"""Maximum number of dense keypoints per image that confirm a homography. Chosen by hand."""
 
 MIN_PARTNERS = 3
 """A pair is not registered if other pairs already connect its images and each image has at least
@@ -45,7 +45,7 @@ MAX_FURTHER_TRIALS = 2
 """If dense matches reject a geometry, up to this many others are tried, which takes time."""
 
 MAX_DISAGREEMENT_PX = 2.0
-"""A pair is registered again if its RMS distance from the joint fit is larger. Chosen by hand."""
+"""A pair whose RMS distance from the joint fit exceeds this is tried again. Chosen by hand."""
 
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
@@ -188,8 +188,7 @@ def _registered_pairs(
         for _ in range(MAX_FURTHER_TRIALS):
             if pair is not None or geometry.matrix is None:
                 break
-            # On repeated structure, most matches may agree on a wrong geometry, so the others are
-            # tried.
+            # Most matches on repeated structure may be wrong, so the others are tried alone.
             tentative = tentative.apart_from(geometry.matrix)
             geometry = estimate_initial_geometry(tentative, "homography", seed)
             pair = _register(views, first, second, geometry, seed)
