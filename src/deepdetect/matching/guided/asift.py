@@ -96,8 +96,7 @@ def simulate_view(
 
 
 def _fitting(gray: np.ndarray, linear: np.ndarray) -> tuple[tuple[int, int], np.ndarray]:
-    """Return the size of a linearly mapped image, and the affine map that moves it to the
-    origin."""
+    """Return the size of an image after a linear map, and the map, shifted to start at (0, 0)."""
     height, width = gray.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ linear.T
     low = corners.min(0)
