@@ -194,7 +194,7 @@ def register(
 def _union(
     shape0: tuple[int, ...], shape1: tuple[int, ...], homography: np.ndarray
 ) -> tuple[int, int, int, int]:
-    """Return left, top, right and bottom of the union of two images, in pixels of the first."""
+    """Return left, top, right and bottom of two images' union, in pixels of the first image."""
     height, width = shape1[:2]
     corners = outer_corners((width, height))
     back = np.linalg.inv(homography)

@@ -52,7 +52,7 @@ MIN_COARSE_INLIERS = 50
 any model has. If SIFT on larger copies gives fewer inliers, learned descriptors are tried."""
 
 MIN_COARSE_DEPTH_INLIERS = 200
-"""Minimum inliers of a fundamental matrix in the coarse pass. Chosen on Oxford and others."""
+"""Inliers that a fundamental matrix of the coarse pass needs. Chosen on Oxford and others."""
 
 MIN_COARSE_FRACTION = 0.5
 """Minimum fraction of inliers in the coarse pass. Chosen on Oxford and others."""

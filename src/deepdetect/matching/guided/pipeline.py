@@ -287,7 +287,7 @@ def _apart_from_plane(
         errors = epipolar_errors(points0[on], points1[on], rest.matrix)
         if np.mean(errors < GUIDING_THRESHOLDS_PX["homography"]) >= MIN_ON_LINES:
             continue
-        # The rest has depth only if its matches off its largest plane agree on an epipole.
+        # The rest of the scene has depth only if matches off its largest plane agree on an epipole.
         rest0, rest1 = points0[~on][rest.inliers], points1[~on][rest.inliers]
         another = _fit(rest0, rest1, "homography", grays[1], seed)
         if another.matrix is None or (

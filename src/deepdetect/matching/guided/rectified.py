@@ -216,7 +216,7 @@ def rectified_view(
     seen = None if isinstance(frame, PolarFrame) else find_disparity_range(first, second)
     if seen is not None:
         widened = min(low, seen[0]), max(high, seen[1])
-        # This range may be far off. It is used only if images of this size can be searched over it.
+        # The range of the small copy may be far off, so it must be searchable at this image size.
         if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
             low, high = widened
     widest = frame.size[0] - 1
