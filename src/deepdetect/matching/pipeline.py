@@ -34,13 +34,12 @@ from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
-"""The stages that `match_images` reports. Only a `DeepDetect` without masks has the first as a
-stage of its own. All other detectors give keypoints first, and the initial geometry is found in the
-third stage, from the points of a `PointDetector` if there are enough."""
+"""The stages that `match_images` reports. "initial geometry" is reported only for a `DeepDetect`
+without masks; otherwise the initial geometry is part of "guided matching"."""
 
 MAX_RETURN_ERROR_PX = 2.0
-"""A match counts as found in both directions if the reverse match that starts nearest to its end,
-at most 1.5 px away in x and in y, ends at most this far from its start. Chosen by hand."""
+"""If `mutual`, a match is kept only if the reverse match that starts nearest to its end leads back
+to within this distance of its start. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -63,8 +62,6 @@ def match_images(
 ) -> Matches:
     """Detect and match the keypoints of two images: a geometry from a few matches guides the rest.
 
-    `match_features` matches by descriptors alone.
-
     Args:
         image0, image1: anything `load_image` takes.
         detector: a `DeepDetect` or a `PointDetector`, or any object with a method `heatmap` or
@@ -79,18 +76,16 @@ def match_images(
             of the first two that fits the images.
         mutual: keep only one-to-one matches that are found in both directions, which takes twice
             the time. The order of the images then does not matter.
-        tentative_matches: a few matches of another matcher (LightGlue, LoFTR, clicks), some of
-            which may be wrong: two (K, 2) arrays of positions, where row k of one matches row k of
-            the other. Or the result of `find_tentative_matches`. The initial geometry is then
-            estimated from these matches instead of our own SIFT matches.
+        tentative_matches: matches of another matcher (LightGlue, LoFTR, clicks), some of which may
+            be wrong: two (K, 2) arrays of corresponding positions, or the result of
+            `find_tentative_matches`. They replace our own SIFT matches in the initial geometry.
         seed: seed of all random choices.
         options: how the final geometry is estimated.
         progress: called with the name of each stage when it ends.
 
     Returns:
-        The matches, their geometry, and which of them agree with it. If no geometry can be trusted,
-        there are no matches (`Matches.success` is False), and keypoints are only detected when they
-        are accessed.
+        The matches, their geometry, and which matches agree with it. If no geometry can be trusted,
+        there are no matches, and `Matches.success` is False.
 
     Raises:
         ImageError: an image cannot be read or is unsuitable.
@@ -118,8 +113,7 @@ def match_images(
         cache(partial(find_keypoints, detector, image, selection, mask))
         for image, mask in zip(rgb, masks, strict=True)
     ]
-    # The network's keypoints take no part in the initial geometry, and finding them cannot fail. So
-    # they are found last, because they are not needed if no geometry can be trusted.
+    # The initial geometry does not use a network's keypoints, so they are detected after it.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     settings = guiding, model, seed, options, keypoints_last, timer
     matches = _match_guided(grays, (find[0], find[1]), source, *settings)
@@ -149,12 +143,12 @@ def match_features(
         matcher: "flann", "exact", "patchmatch", "hamming" for binary descriptors, or "auto":
             "exact" for few keypoints, otherwise "patchmatch" for dense ones and "flann" for others.
         filter_by: which nearest neighbours are matches: "ratio" keeps those that pass Lowe's ratio
-            test, "neighbours" those that move, rotate and grow as the matches around them do. A
-            small network decides on the latter; it gives more correct matches and fewer wrong ones.
-            It needs at least nine mutual neighbours, learned descriptors (not cross-modal) or
-            RootSIFT, and keypoints with sizes and angles.
-        ratio: upper limit of the distance to the best descriptor over that to the second-best.
-            None: 0.85, or 0.88 for learned descriptors, for which that is equally strict.
+            test; with "neighbours", a small network keeps those that move, rotate and scale as the
+            matches around them. The network gives more correct and fewer wrong matches. It needs at
+            least nine mutual neighbours, learned descriptors (not cross-modal) or RootSIFT, and
+            keypoints with sizes and angles.
+        ratio: maximum ratio of the descriptor distances to the nearest and the second-nearest
+            neighbour. None: 0.85, or 0.88 for learned descriptors, which is as strict for them.
         mutual: keep only mutual nearest neighbours.
         seed: seed of a matcher that is random.
 
@@ -163,9 +157,8 @@ def match_features(
         with "neighbours", the network's probabilities, above 0.5, that the match is correct.
 
     Raises:
-        OptionError: an option is unknown, out of its range, or incompatible with the others;
-            keypoints have no descriptors, descriptors of two types or lengths, or too many to fit
-            in memory.
+        OptionError: an option is unknown, out of its range, or incompatible with the others; or
+            descriptors are missing, of two types or lengths, or too many for the memory.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -253,8 +246,7 @@ def _match_guided(
         guide, matched = guided_matches(grays, pixels, first, seed)
     if matched is None:
         return _no_matches(*keypoints, guide, timer)
-    # If matches do not end at keypoints of the second image, they begin at pixels of the first
-    # image and end where the second image shows these pixels.
+    # If both ends are keypoints, their sub-pixel positions replace the rounded ones.
     points = matched.starts(pixels[0]).astype(np.float32), matched.points1.astype(np.float32)
     if matched.indices1 is not None:
         points = keypoints[0].xy[matched.indices0], keypoints[1].xy[matched.indices1]
@@ -313,7 +305,7 @@ def _no_matches(
 def _final_geometry(
     points: Points, model: str, seed: int, options: GeometryOptions, guide: TwoViewGeometry
 ) -> Geometry:
-    """Return the guiding geometry if the caller's model and options allow it, or estimate one."""
+    """Return the guiding geometry if the model and options allow it, otherwise estimate one."""
     if options.homography is None and guide.matrix is not None and model in ("auto", guide.model):
         errors_of = transfer_errors if guide.model == "homography" else epipolar_errors
         errors = errors_of(*points, guide.matrix)

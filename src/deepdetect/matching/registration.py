@@ -29,7 +29,7 @@ from .pipeline import match_images
 Extent = Literal["reference", "union"]
 
 MAX_UNION = 4
-"""The frame of a union may have this many times the pixels of both images. Chosen by hand."""
+"""The frame of a union has at most this many times the pixels of both images. Chosen by hand."""
 
 SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
@@ -39,9 +39,9 @@ SHIFTS = (1 / 6, 1 / 4)
 measure how well unrelated content correlates. Chosen by hand."""
 
 MIN_DEVIATIONS = 4.0
-"""Two images agree if their correlation exceeds the mean correlation of shifted images (`SHIFTS`)
-by this many standard deviations. The excess was 9 to 70 for image 1 with images 4 and 6 of each
-Oxford scene, and 1.8 for images of different scenes."""
+"""Two images agree if their correlation exceeds the mean of shifted copies (`SHIFTS`) by this many
+standard deviations. It does by 9 to 70 for images 1 and 4, or 1 and 6, of an Oxford scene, and by
+1.8 for images of different scenes."""
 
 COMPARED_SIDE_PX = 480
 """Images are reduced to this longer side before they are compared. Chosen by hand."""
@@ -49,12 +49,11 @@ COMPARED_SIDE_PX = 480
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Registration:
-    """A second image in the frame of a first.
+    """Two images in one frame: the second is warped to the first by a homography.
 
     Attributes:
         homography: (3, 3) from the first image to the second.
-        first: (H, W, 3) uint8 RGB, the first image in the frame. With the extent "union" it is
-            black outside its own area.
+        first: (H, W, 3) uint8 RGB, the first image in the frame, black outside its own area.
         warped: (H, W, 3) RGB, the second image warped into the frame, black where it has no
             content. It is uint16 if the second image has more than 8 bits, otherwise uint8.
         valid: (H, W) bool, where the warped image has content.
@@ -195,7 +194,7 @@ def register(
 def _union(
     shape0: tuple[int, ...], shape1: tuple[int, ...], homography: np.ndarray
 ) -> tuple[int, int, int, int]:
-    """Return left, top, right and bottom of the union of two images, in pixels of the first."""
+    """Return left, top, right and bottom of two images' union, in pixels of the first image."""
     height, width = shape1[:2]
     corners = outer_corners((width, height))
     back = np.linalg.inv(homography)
@@ -212,10 +211,7 @@ def _union(
 
 
 def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
-    """Return whether two images, (H, W) uint8 luma, are alike once a homography aligns them.
-
-    Their correlation must clearly exceed that of shifted images, which show unrelated content.
-    """
+    """Return whether two images, (H, W) uint8 luma, are alike once a homography aligns them."""
     first, scale0 = downscale(gray0, COMPARED_SIDE_PX)
     second, scale1 = downscale(gray1, COMPARED_SIDE_PX)
     matrix = scaled_homography(homography, scale0, scale1)

@@ -25,8 +25,7 @@ from ...features.learned import LEARNED
 from ...io.image import MINIMUM_SIDE
 
 BLUR = 0.8
-"""Sigma of the blur before an image is compressed, in units of sqrt(tilt^2 - 1), as in the
-paper."""
+"""Sigma of the blur before compression, in pixels per sqrt(tilt^2 - 1), as in the paper."""
 
 ROUNDING = 1e-9
 """A fraction of a pixel below this is a rounding error, and ignored when sizes are rounded up."""
@@ -34,11 +33,10 @@ ROUNDING = 1e-9
 OUTSIDE: dict[str, Any] = {"borderValue": 128}
 
 TILT, DIRECTIONS = 4.0, 8
-"""The first value is the factor by which a simulated view is compressed along one direction, the
-second the number of directions. Learned descriptors alone tolerate tilts of two or three. On 60
-oblique pairs with tilts of 2 to 6, none of which gives a geometry without simulated views, these
-values gave one for all 60. A tilt of 3 and five directions gave one for 55, and SIFT with 30 views
-at tilts of 2 and 4 for 33."""
+"""Factor by which a simulated view is compressed, and number of directions of compression. On 60
+oblique pairs with tilts of 2 to 6, all of which fail without simulated views, these values gave a
+geometry for all 60, a tilt of 3 with five directions for 55, and SIFT with 30 views at tilts of 2
+and 4 for 33."""
 
 
 def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
@@ -57,9 +55,9 @@ def _detector(max_keypoints: int) -> PointDetector:
 def simulated_views(
     grays: tuple[np.ndarray, np.ndarray], max_keypoints: int
 ) -> Iterator[tuple[int, Keypoints]]:
-    """Yield the image, 0 or 1, of each simulated view, and the view's keypoints and descriptors.
+    """Yield the image number (0 or 1) of each simulated view, and its keypoints with descriptors.
 
-    The keypoints are at their positions in the original image. Views of the first image come first.
+    Keypoint positions are those in the original image. Views of the first image come first.
     """
 
     def see(side: int, rotation_deg: float) -> tuple[int, Keypoints]:
@@ -98,10 +96,7 @@ def simulate_view(
 
 
 def _fitting(gray: np.ndarray, linear: np.ndarray) -> tuple[tuple[int, int], np.ndarray]:
-    """Return the smallest view that holds an image under a (2, 2) linear map.
-
-    Returns its (width, height), and the (2, 3) affine map: the linear map and a translation.
-    """
+    """Return the size of an image after a linear map, and the map, shifted to start at (0, 0)."""
     height, width = gray.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ linear.T
     low = corners.min(0)

@@ -1,9 +1,8 @@
 """Sparse matches along known epipolar lines.
 
-A ratio test over the whole image rejects repeated structure, because several keypoints look alike.
-With a known fundamental matrix, the partner of a keypoint must lie near its epipolar line. So the
-ratio test here compares only the keypoints near the line. Keypoints far from the line, which cannot
-be partners, show how similar wrong matches are.
+A ratio test over the whole image rejects repeated structure. So the ratio test here compares only
+the keypoints near the epipolar line, where the partner must lie. Keypoints far from the line show
+how similar wrong matches are.
 """
 
 from __future__ import annotations
@@ -17,8 +16,7 @@ from ...features.keypoints import Keypoints
 from ...geometry.transforms import translation_matrix
 
 MAX_DISTANCE_PX = 3.0
-"""Each keypoint of a match lies within this distance of the epipolar line of the other keypoint.
-Chosen by hand."""
+"""Maximum distance of a keypoint from the epipolar line of its partner. Chosen by hand."""
 
 MAX_RATIO_ELSEWHERE = 0.95
 """The descriptor distance of a match must be below this fraction of the distance to the most
@@ -28,8 +26,8 @@ MAX_RATIO_NEAR = 0.85
 """Maximum ratio in the ratio test among the keypoints near an epipolar line. Chosen by hand."""
 
 MIN_SEPARATION_PX = 5.0
-"""Keypoints nearer than this to the most similar one show the same place, so the ratio test near
-the line leaves them out. Chosen by hand."""
+"""The ratio test near the line ignores keypoints closer than this to the best match, because these
+keypoints show the same place. Chosen by hand."""
 
 NULL_SHIFTS = (0.05, 0.1)
 """Chance matches are counted along epipolar lines shifted by these fractions of the longer side of
@@ -39,10 +37,9 @@ the second image. Chosen by hand."""
 def epipolar_search(
     first: Keypoints, second: Keypoints, fundamental: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match keypoints by descriptors, only near each other's epipolar lines and one to one.
+    """Match keypoints one to one by their descriptors, only near each other's epipolar lines.
 
-    Both keypoints of a match are each other's most similar one near the line. Returns their
-    positions, (M, 2) float64 in each image.
+    Returns the positions of the matches, (M, 2) float64 in each image.
     """
     return _search(first, second, _squared_distances(first, second), fundamental)
 
@@ -82,12 +79,11 @@ def _search(
 
 @compiled(nogil=True)
 def _nearest_on_lines(distances, ones0, lines1, ones1, lines0, max_distance, separation):  # type: ignore[no-untyped-def]
-    """Find the partner of each keypoint, the most similar one near its line, and its rivals.
+    """Find the partner of each keypoint: the most similar keypoint near its epipolar line.
 
-    For each keypoint of the first image, returns the index of its partner and three squared
-    descriptor distances: to the partner, to the most similar other keypoint near the line, and to
-    the most similar one far from the line. For each keypoint of the second image, returns the index
-    of its partner and the squared distance to the most similar keypoint far from the line.
+    Returns, for each keypoint of the first image, the index of its partner and three squared
+    descriptor distances: to the partner, to the best other keypoint near the line, and to the best
+    one far from it. For the second image, returns partners and distances far from the lines.
     """
     count0, count1 = distances.shape
     partner0, partner1 = np.zeros(count0, np.int64), np.zeros(count1, np.int64)
@@ -133,12 +129,11 @@ def _points_and_lines(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarra
 def log10_p_value(
     first: Keypoints, second: Keypoints, fundamental: np.ndarray, used: np.ndarray
 ) -> float:
-    """Return the log10 of the probability that chance gives the further matches on epipolar lines.
+    """Return the log10 of the probability that chance explains the new matches on epipolar lines.
 
-    `used` are the positions in the first image of all matches from which the matrix was estimated,
-    correct or wrong: they are no new evidence, so only other matches are counted. Shifted copies of
-    the lines find matches only by chance. Their mean number is taken as the mean of a Poisson
-    distribution, which gives the probability of the number found along the actual lines.
+    Matches are new unless their positions in the first image are in `used`, the (M, 2) positions
+    from which the fundamental matrix was estimated. Matches on shifted lines arise by chance. Their
+    mean number, as the mean of a Poisson distribution, gives the probability.
     """
     distances = _squared_distances(first, second)
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}

@@ -44,7 +44,7 @@ COMPARED_SIDE_PX = 320
 periods of patterns are many pixels long."""
 
 MIN_SHIFT_PX = 10
-"""Shifts of the reduced images below this length are ignored: aligned images correlate there."""
+"""Shorter shifts of the reduced images are ignored, because aligned images correlate there."""
 
 MAX_SHIFTS = 4
 """Maximum number of shifts that are tested: those with the highest correlation. Chosen by hand."""
@@ -59,8 +59,8 @@ MIN_OVERLAP = 0.6
 that contradicts the shift may lie outside the overlap."""
 
 MIN_ZNCC, MIN_ZNCC_GAIN = 0.5, 0.2
-"""A homography explains a place if the ZNCC there is above the first value. It alone explains it if
-the ZNCC under the other homography is also lower by more than the second. Chosen by hand."""
+"""A homography explains a place with a ZNCC above the first value. It alone explains the place if
+its ZNCC also exceeds that of the other homography by more than the second. Chosen by hand."""
 
 MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
 """A homography is preferred to its shifted copy if the places that it alone explains are at least
@@ -68,9 +68,9 @@ the first fraction of all explained places, and at least the second value times 
 that the copy alone explains. Chosen by hand."""
 
 MIN_EXPLAINED_FRACTION = 0.25
-"""If fewer than `MIN_COMPARED` places can be compared, a homography must explain more than this
-fraction of the places of sparse matches. It is 0.44 or more for correct matches, and 0 for those of
-two unrelated photographs."""
+"""A homography must explain more than this fraction of the sparse matches if fewer than
+`MIN_COMPARED` places can be compared. The fraction is 0.44 or more for correct matches, 0 for
+unrelated images."""
 
 OFF_PLANE_PX = 6.0
 """A match with a larger transfer error under the homography is off the plane. Chosen by hand."""
@@ -86,21 +86,19 @@ MIN_AROUND = 5
 windows around it contain matches. Chosen by hand."""
 
 MIN_COMPARED = 20
-"""If fewer places or windows than this can be compared, the comparison decides nothing. Chosen by
-hand."""
+"""Comparisons of fewer places or windows than this decide nothing. Chosen by hand."""
 
 FALSE_POSITIVE_RATE = 0.05
-"""A match passes if the correlation of its window, averaged with those around it, is above that of
-all but this fraction of unrelated windows. Chosen by hand."""
+"""A match passes if the mean correlation of its window and those around it is above that of all but
+this fraction of unrelated windows. Chosen by hand."""
 
 NEIGHBOURS = 8
 """Each sparse match is compared with this many of its nearest sparse matches. Chosen by hand."""
 
 MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
-"""The steps from a match to a neighbour, in both images, give a rotation and a scale: one complex
-number. Two of them agree if they differ by less than the first value times their magnitude, which
-allows for tilt and depth, plus the second value, the error of a step in pixels, divided by the
-length of the step. Chosen by hand."""
+"""The steps from a match to a neighbour in both images give a rotation and a scale: one complex
+number. Two numbers agree if they differ by less than the first value times their magnitude, for
+tilt and depth, plus the second value, for position errors, over the step length. Chosen by hand."""
 
 
 def is_repeated(
@@ -113,10 +111,10 @@ def is_repeated(
 ) -> bool:
     """Return whether a shifted copy of a homography explains the points as well as the original.
 
-    `points0` are the (N, 2) positions in the first image of dense matches or, if `distinct`, of
-    sparse matches that passed the ratio test. `sparse` are the positions of all tentative matches,
-    (M, 2) in each image, many of them wrong. They are searched for an epipole: relative to the
-    correct homography, whatever lies off the plane moves towards an epipole or away from it.
+    `points0`, (N, 2), are positions in the first image of dense matches or, if `distinct`, of
+    sparse matches that passed the ratio test. `sparse` are all tentative matches, (M, 2) in each
+    image, many of them wrong. Off the plane, the correct ones agree on an epipole relative to the
+    correct homography only.
     """
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
@@ -132,8 +130,8 @@ def is_repeated(
         middle = np.array([last / 2])
         if transfer_errors(middle, middle, step)[0] < MIN_SHIFT_PX:
             continue  # the refinement undid the shift
-        # If the pattern ends in both images, its rest may be hidden. So a place where the first
-        # image shows the same content one shift away is no evidence for the homography.
+        # Content that recurs one shift away in the first image is no evidence for the homography:
+        # where the pattern ends, its next period may just be hidden.
         recurring = [warped_zncc(first, first, move) for move in (step, np.linalg.inv(step))]
         recurs = np.fmax(*recurring)[places] > MIN_ZNCC
         explained = np.fmax(own, others) > MIN_ZNCC  # False where both are NaN
@@ -159,7 +157,7 @@ def is_repeated(
 def _parallax_decides(
     first: np.ndarray, scale0: float, sparse: Pair, plane: np.ndarray, copy: np.ndarray, seed: int
 ) -> bool:
-    """Return whether matches off a plane share an epipole relative to it, but not to its copy."""
+    """Return whether matches off `plane` agree on an epipole relative to it, but not to `copy`."""
     points0, points1 = sparse
     on_plane = transform_points(points1, np.linalg.inv(plane))
     starts, ends = (scaled_points(points, scale0) for points in (points0, on_plane))
@@ -202,10 +200,9 @@ def compare_held_out(
 ) -> tuple[float, np.ndarray]:
     """Compare each window of the first image with its predicted place in the second image.
 
-    The matches around a window, but not those in it, predict its place. `points0` and `points1` are
-    the (M, 2) positions of matches in each image. Returns the median correlation of the windows,
-    which is 0 if too few can be compared, and (M,) bool, which is False for matches whose window is
-    no more similar than unrelated windows.
+    The matches around a window, not those in it, predict its place. Takes (M, 2) positions of
+    matches. Returns the median correlation of the windows, 0 if too few can be compared, and (M,)
+    bool, false for matches whose window is no more similar than unrelated windows.
     """
     (first, scale0), (second, scale1) = (downscale(gray, HELD_OUT_SIDE_PX) for gray in grays)
     points0, points1 = scaled_points(points0, scale0), scaled_points(points1, scale1)
@@ -236,7 +233,7 @@ def compare_held_out(
 
 
 def _mean_around(values: np.ndarray) -> np.ndarray:
-    """Average a (rows, columns) grid over 3 x 3 cells without NaN; NaN itself stays NaN."""
+    """Average each cell of a 2-D grid with its eight neighbours; NaN is left out and stays NaN."""
     known = np.isfinite(values)
     total, count = (
         cv2.boxFilter(part, cv2.CV_64F, (3, 3), borderType=cv2.BORDER_CONSTANT)
@@ -250,9 +247,8 @@ def _affine_maps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """For each window of a grid, fit an affine map to the matches of the eight windows around it.
 
-    `shape` is the (rows, columns) of the grid, and `windows` holds the (M,) indices of the matches'
-    windows in the flattened grid. Returns the (rows, columns, 3, 2) maps, and a (rows, columns)
-    bool array that is true where a map exists.
+    `windows` holds the (M,) indices of the matches' windows in the flattened grid. Returns the
+    (rows, columns, 3, 2) maps, and a (rows, columns) bool array, true where a map exists.
     """
     size = shape[0] * shape[1]
 
@@ -277,8 +273,8 @@ def _affine_maps(
 def moving_alike(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     """Return, for each of (M, 2) matches, the fraction of its nearest matches that move as it does.
 
-    The steps from the match to a neighbour, in both images, give a rotation and a scale. The
-    largest group of neighbours that agree with one of them counts as moving like the match.
+    Each neighbour gives a rotation and a scale (see `MAX_MOVE_DIFFERENCE`). The largest group of
+    neighbours that agree with one of them counts as moving like the match.
     """
     neighbours = min(NEIGHBOURS, len(points0) - 1)
     if neighbours < 1:

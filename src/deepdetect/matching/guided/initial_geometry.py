@@ -1,11 +1,10 @@
 """The initial geometry of a pair from tentative matches, or the answer that none can be trusted.
 
-A coarse pass matches SIFT keypoints of small copies. Its result is used if the pair is clearly a
-plane or clearly has depth. Otherwise SIFT keypoints of larger copies are matched. If they give no
-geometry, or if cross-modal descriptors show that the images come from two sensors, learned
-descriptors replace SIFT. Simulated views (`asift`) are the last resort. `geometry.two_view` chooses
-the model. Its thresholds, and those in this module whose notes name no other source, were chosen on
-all of Oxford and Middlebury, Strecha's fountain and a KITTI clip.
+A coarse pass matches SIFT keypoints of small copies. Its result is used if it clearly shows a plane
+or depth. Otherwise SIFT keypoints of larger copies are matched. If they give no geometry, or if the
+images come from two sensors, learned descriptors replace SIFT. Simulated views (`asift`) are the
+last resort. `geometry.two_view` chooses the model. Its thresholds, and those below without another
+source, were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip.
 """
 
 from __future__ import annotations
@@ -43,56 +42,48 @@ from .tentative_matches import (
 )
 
 LEARNED_KEYPOINTS = 2048
-"""Maximum number of keypoints with learned descriptors, which are used if SIFT shows no geometry.
-Chosen by hand."""
+"""Maximum number of keypoints with learned descriptors. Chosen by hand."""
 
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
-"""Longer side in pixels, and maximum number of keypoints, of the small copies in the coarse pass.
-Chosen on the data sets that the module names."""
+"""Longer side in pixels and maximum keypoints in the coarse pass. Chosen on Oxford and others."""
 
 MIN_COARSE_INLIERS = 50
-"""The result of the coarse pass is used if a homography has at least this many inliers, and the
-result of the caller's keypoints if a model of any kind has. If SIFT on larger copies gives fewer
-inliers than this, learned descriptors are tried."""
+"""The coarse pass is used if a homography has at least this many inliers, the caller's keypoints if
+any model has. If SIFT on larger copies gives fewer inliers, learned descriptors are tried."""
 
 MIN_COARSE_DEPTH_INLIERS = 200
-"""The result of the coarse pass is used if a fundamental matrix has at least this many inliers.
-Chosen on the data sets that the module names."""
+"""Inliers that a fundamental matrix of the coarse pass needs. Chosen on Oxford and others."""
 
 MIN_COARSE_FRACTION = 0.5
-"""The result of the coarse pass is used only if, in addition, at least this fraction of its matches
-are inliers. Chosen on the data sets that the module names."""
+"""Minimum fraction of inliers in the coarse pass. Chosen on Oxford and others."""
 
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
 """Longer side in pixels, and maximum number of keypoints, of the images from which oblique views
 are simulated. Each view has half as many keypoints. Chosen by hand."""
 
 WINDOW_PX = 16
-"""Side of the windows around matches that are checked for inverted brightness. Chosen by hand."""
+"""Side in pixels of the windows that are checked for inverted brightness. Chosen by hand."""
 
 MIN_GAIN = 1.2
-"""Images are from two sensors if cross-modal descriptors give at least this many times the
-tentative matches that learned descriptors give. The ratio is 1.5 to 30 for visible and infrared
-light, and up to 1.17 for two photographs."""
+"""Images are from two sensors if cross-modal descriptors give at least this many times the matches
+of learned descriptors: 1.5 to 30 for visible and infrared light, up to 1.17 for photographs."""
 
 MIN_INVERTED = 0.05
-"""Images are also from two sensors if at least this fraction of the inliers has inverted
-brightness: dark in one image, bright in the other. The fraction is up to 0.04 for wide-baseline
-pairs from the KITTI clips, because of wrong matches."""
+"""Images are also from two sensors if at least this fraction of the inliers is dark in one image
+and bright in the other. Wrong matches give up to 0.04 for wide-baseline pairs of KITTI."""
 
 MAX_LEARNED_LOG10_NFA, MAX_CROSS_MODAL_LOG10_NFA = -10.0, -22.0
-"""The log10 number of false alarms must be below the first value if only learned descriptors show a
-geometry, and below the second if only cross-modal descriptors do. Such low values are needed
-because networks also see the image borders, which lie at the same places in unrelated images.
-Unrelated photographs reach -8 with learned descriptors. With cross-modal descriptors, noise of
-320x240 pixels reaches -20, and visible and infrared light have -24 or less."""
+"""Maximum log10 number of false alarms of a geometry from learned and from cross-modal descriptors.
+The values are low because networks also see image borders, which match in unrelated images.
+Unrelated photographs reach -8 with learned descriptors. With cross-modal ones, noise of 320x240
+pixels reaches -20, and visible and infrared light have -24 or less."""
 
 MAX_MATCHES_TO_SEARCH = 200
-"""Further matches are searched along the epipolar lines of a matrix with fewer inliers."""
+"""If a fundamental matrix has fewer inliers, more are searched along its epipolar lines."""
 
 MAX_HINT_LOG10_NFA = 0.0
-"""A geometry that is not trusted may be more than chance if its log10 number of false alarms is
-below this. Then larger copies are tried, and further matches along its epipolar lines counted."""
+"""If an untrusted geometry has a log10 number of false alarms below this, it may be more than
+chance: larger copies are tried, and further matches along its epipolar lines are counted."""
 
 
 Source = TentativeMatches | Pair | tuple[Keypoints, Keypoints] | None
@@ -224,8 +215,8 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     """Find the geometry from keypoints with learned descriptors, or cross-modal ones if needed.
 
     In different light, in the dark, under blur or from another side, these keypoints have two to
-    fifteen times as many inliers as SIFT's keypoints. SIFT has more if one image is four times as
-    large as the other. SIFT's positions are more exact, which helps to tell depth from a plane.
+    fifteen times the inliers of SIFT. SIFT's positions are more exact, which helps to tell depth
+    from a plane.
     """
     as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
     seen = as_it_is.views, as_it_is.features
@@ -241,7 +232,7 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
 
 
 def _is_inverted(tentative: TentativeMatches, geometry: InitialGeometry) -> bool:
-    """Return whether `MIN_INVERTED` of the inliers are dark in one image, bright in the other."""
+    """Return whether enough inliers (`MIN_INVERTED`) are dark in one image, bright in the other."""
     scale0, scale1 = tentative.scales
     agreeing = scaled_points(geometry.points0, scale0), scaled_points(geometry.points1, scale1)
     correlations = zncc_at_points(tentative.views, agreeing, WINDOW_PX)
@@ -265,7 +256,7 @@ def _is_clear(geometry: InitialGeometry) -> bool:
 
 def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> InitialGeometry:
     """Estimate the geometry from sparse matches of another matcher, some of them wrong."""
-    # Positions are scaled down to images of this side, for which the thresholds were chosen.
+    # Thresholds are in pixels of images with this longer side, so larger positions are scaled down.
     scale0, scale1 = (min(1.0, MAX_SIDE_PX / max(gray.shape)) for gray in grays)
     size0, size1 = (
         (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
@@ -315,7 +306,7 @@ def estimate_initial_geometry(
 def _matches_of_views(
     tentative: TentativeMatches, view_keypoints: int
 ) -> tuple[Pair, np.ndarray, int]:
-    """Return the matches, those of simulated views included: positions, ratios, number of views."""
+    """Add the matches of simulated views; return positions, ratios and the number of views."""
     found = [(*tentative.matched, tentative.ratios)]
     for side, seen in simulated_views(tentative.views, view_keypoints):
         further = match_sparse(seen, tentative.features[1 - side])

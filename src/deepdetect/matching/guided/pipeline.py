@@ -41,17 +41,16 @@ MIN_VERIFIED_FRACTION = 0.5
 verified. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_UNMATCHED_FRACTION = 0.5
-"""This fraction or more of a further plane's matches must lie where nothing is matched yet. Those
-of a shifted copy of a repeated pattern lie where the pattern is already matched."""
+"""A further plane needs at least this fraction of its matches where nothing is matched yet. A
+shifted copy of a repeated pattern only gives matches where the pattern is already matched."""
 
 MATCHED_PX = 9
 """Side of the window around a match in which the first image counts as matched. Chosen by hand."""
 
 MIN_OFF_PLANE_FRACTION = 0.02
 """A scene with a plane has depth if the dense matches off the plane are at least this fraction of
-those on it. The same must hold for the sparse matches, and for the patches that do not fit the
-plane relative to those that do. The fraction is up to 0.013 for the planar scenes of Oxford, which
-are not quite flat, and 0.032 or more for facades."""
+those on it. The fraction is up to 0.013 for the planar scenes of Oxford, which are not quite flat,
+and 0.032 or more for facades. Sparse matches and compared patches must pass the same test."""
 
 MAX_MOVING_PLANES = 3
 """Maximum number of planes that are tested for a motion of their own. One is not enough, because
@@ -62,13 +61,13 @@ MIN_ON_LINES = 0.33
 of the scene. The fraction is up to 0.3 for planes that were pasted into scenes with depth."""
 
 MIN_REST_FRACTION, MIN_REST_RATIO = 0.5, 1.05
-"""If a plane moves on its own, the rest of the scene may get a fundamental matrix of its own. At
-least the first fraction of the rest's matches must be its inliers. They must also be more than the
-second number times the inliers of the common matrix among these matches. Chosen by hand."""
+"""If a plane moves on its own, the rest of the scene may get its own fundamental matrix. This
+matrix must fit at least the first fraction of the rest's matches, and more than the second value
+times as many of them as the common matrix of all matches. Chosen by hand."""
 
 MAX_REST_LOG10_NFA = -20.0
-"""The rest of a scene with a moving plane must agree on an epipole with a log10 number of false
-alarms below this, relative to its own largest plane. A plane alone has -7."""
+"""Apart from a moving plane, a scene has depth if its matches agree on an epipole, relative to
+their largest plane, with a log10 number of false alarms below this. A plane alone has -7."""
 
 MAX_PARALLAX_LOG10_NFA = -40.0
 """Sparse matches off the plane also prove depth if they agree on an epipole with a log10 number of
@@ -87,9 +86,8 @@ MAX_CLEAR_LOG10_NFA, MIN_CLEAR_CORRELATION = -12.0, 0.5
 the correlation of held-out windows above the second. Chosen by hand."""
 
 MIN_OWN_FRACTION = 0.67
-"""High confidence also needs at least this fraction of all matches to follow the geometry, not
-further planes that move differently. Such a plane may be an overlay that stands still, for example
-the round rim of a microscope."""
+"""High confidence also needs at least this fraction of all matches to follow the geometry. The
+others lie on planes that move differently, such as an overlay that stands still."""
 
 MIN_MATCHED_FRACTION = 0.02
 """Dense matching has failed if it matches less than this fraction of the keypoints. For a scene
@@ -99,8 +97,7 @@ MIN_MATCHES = 8
 """A geometry that gives fewer final matches than this is rejected. Chosen by hand."""
 
 MIN_MOVING_ALIKE = 0.6
-"""A sparse match is verified if at least this fraction of its nearest matches moves as it does.
-Chosen by hand."""
+"""A sparse match is verified if this fraction of its neighbours moves like it. Chosen by hand."""
 
 MIN_ALIKE_FRACTION = 0.3
 """Sparse matches are returned only if at least this fraction of them is verified. At random places,
@@ -125,8 +122,7 @@ MAX_SCALE_RATIO = 1.5
 while the homography is refined, because corners of different scales lie at different places."""
 
 MIN_SCALE = 1 / 16
-"""Minimum scale to which the finer image is reduced. If scales differ more, nothing can be
-refined."""
+"""The finer image is reduced at most to this scale. If scales differ more, refinement fails."""
 
 
 def guided_matches(
@@ -214,7 +210,7 @@ def _plane_or_depth(
     evidence = replace(plane[0].evidence, verified=verified)
     plane = replace(plane[0], evidence=evidence), plane[1]
     if first.cross_modal:
-        # If the patches of images of two sensors differ, this is no evidence of depth.
+        # In images of two sensors, patches that differ are no evidence of depth.
         if plane[1] is None:
             plane = _sparsely(grays[0], pixels[0], first)
         if plane[1] is not None:
@@ -236,8 +232,7 @@ def _plane_or_depth(
             yield apart, None
         yield joint, matrix if planar else None
         if not planar and first.others:
-            # If something moves on its own, a fundamental matrix that also explains a part of it is
-            # less exact for the rest. So the matches off the plane are also tried alone.
+            # If something moves, the matches off the plane alone may give a better matrix.
             yield guiding_geometry(grays, "fundamental", seed, first.others), None
 
     depth, geometry, matches = _first_that_matches(grays, pixels[0], ways(), enough)
@@ -267,8 +262,7 @@ def _apart_from_plane(
 ) -> InitialGeometry | None:
     """Return the geometry of the rest of the scene if a plane moves on its own, otherwise None.
 
-    `depth` is the common fundamental matrix of all matches. If a plane moves on its own, this
-    matrix fits the plane or the rest, and only a part of the other.
+    `depth` is the geometry with the common fundamental matrix of all matches.
     """
     if first.others is None or depth.matrix is None:
         return None
@@ -293,8 +287,7 @@ def _apart_from_plane(
         errors = epipolar_errors(points0[on], points1[on], rest.matrix)
         if np.mean(errors < GUIDING_THRESHOLDS_PX["homography"]) >= MIN_ON_LINES:
             continue
-        # A plane fits many fundamental matrices. So the rest has depth only if it consists of more
-        # than a plane: its matches off its largest plane must agree on an epipole.
+        # The rest of the scene has depth only if matches off its largest plane agree on an epipole.
         rest0, rest1 = points0[~on][rest.inliers], points1[~on][rest.inliers]
         another = _fit(rest0, rest1, "homography", grays[1], seed)
         if another.matrix is None or (
@@ -353,8 +346,8 @@ def _first_that_matches(
 ) -> tuple[InitialGeometry, TwoViewGeometry, GuidedMatches | None]:
     """Match by one initial geometry after another, until one gives enough matches.
 
-    Each of the `ways` is a geometry with the homography of a plane, or with None. Returns the
-    geometry that gives most matches, or the first of several with equally many, and its result.
+    Each of the `ways` is a geometry and the homography of a plane or None. Returns the geometry
+    with the most matches, and its result.
     """
     best, most = None, -1
     for first, plane in ways:
@@ -381,8 +374,7 @@ def _match_depth(
     sparse = first.points0, first.points1
     dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if plane is None and (dense is None or len(dense[1]) < enough):
-        # Pairs with a wide baseline can be rectified if they mostly show a plane, whose homography
-        # makes the views similar.
+        # The homography of a large plane makes the views of a wide-baseline pair similar.
         seen = _fit(*sparse, "homography", grays[1])
         if seen.matrix is not None and seen.trusted:
             plane = _refine_homography(grays, seen.matrix)
@@ -422,10 +414,9 @@ def match_by_homography(
 ) -> tuple[GuidedMatches, float]:
     """Match keypoints by a homography, and keep those whose patches are the same.
 
-    Each keypoint of the first image is matched at most once, with the score 1 - `dissimilarity`.
-    Also returns the fraction of the compared keypoints whose patches are the same. All keypoints
-    with a partner under the homography are compared or, if these are few, all keypoints that it
-    maps into the second image.
+    Scores are 1 - `dissimilarity`. Also returns the fraction of the compared keypoints whose
+    patches are the same. If few keypoints have a partner under the homography, all keypoints that
+    it maps into the second image are compared.
     """
     size1 = grays[1].shape[::-1]
     predicted = transform_points(pixels[0], homography)
@@ -463,7 +454,6 @@ def _compare(grays: Pair, pixels0: np.ndarray, homography: np.ndarray, seed: int
 
 
 def _refine_homography(grays: Pair, homography: np.ndarray) -> np.ndarray:
-    """Refine a homography, (3, 3), on scaled copies of the images."""
     scales = _scales_at_centre(homography, grays[0].shape)
     (small0, scale0), (small1, scale1) = (
         downscale(gray, min(MAX_REFINED_SIDE_PX, round(max(gray.shape) * scale)))
@@ -476,8 +466,8 @@ def _refine_homography(grays: Pair, homography: np.ndarray) -> np.ndarray:
 def _scales_at_centre(homography: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
     """Return the factors by which to scale the images so that both show equally fine detail.
 
-    An image is scaled down if it is finer: its scale is larger than that of the other image in
-    every direction, by a factor of more than `MAX_SCALE_RATIO`, at the centre of the first image.
+    The finer image is scaled down if, at the centre of the first image, its scale is larger in
+    every direction by a factor of more than `MAX_SCALE_RATIO`.
     """
     centre = np.array([shape[1] / 2, shape[0] / 2])
     around = transform_points(centre + [[0, 0], [1, 0], [0, 1]], homography)

@@ -5,8 +5,8 @@ and a small copy of the pair give. Each match ends at a sub-pixel position, not 
 
 A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
 are tracked from one view to the other, starting from the matches of the rows, and the matrix is
-fitted to the tracks. If its epipolar lines then differ from the rows, or if the disparities turn
-out to have so narrow a range that larger images can be searched, the images are rectified again.
+fitted to the tracks. The images are rectified again if the new epipolar lines differ from the rows,
+or if the disparities have so narrow a range that larger images can be searched.
 
 The constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, unless noted.
 """
@@ -45,73 +45,61 @@ DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """Options for matching rows. The range of disparities is set for each pair."""
 
 MAX_VOLUME = 5e7
-"""Maximum number of pixels of the frame times the number of disparities. Images that need more are
-scaled down, to bound time and memory."""
+"""Images are scaled down if pixels times disparities exceed this, to bound time and memory."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """The range of disparities is extended at both ends by this many pixels plus this fraction of its
-length. Chosen on the data sets that the module names."""
+length. Chosen on Oxford and others."""
 
 MIN_FRACTION_OF_ONE_SIGN = 0.8
-"""Disparities of one sign mean motion away from the epipole of a polar frame, those of the other
-sign motion towards it. If more than this fraction of the sparse matches has one sign, the range
-extends only by `MARGIN_PX` into the other sign. Chosen on the data sets that the module names."""
+"""If more than this fraction of the sparse matches in a polar frame has disparities of one sign,
+the range extends only by `MARGIN_PX` into the other sign. Chosen on Oxford and others."""
 
 CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
-"""The two rectified views are blurred with the second value as sigma, and correlated in windows
-with the first value as side."""
+"""Side of the windows in which rectified views are correlated, and sigma of the preceding blur."""
 
 MIN_CORRELATION = 0.3
 """A match is dropped if the correlation of its windows is below this, unless `FALSE_DISCOVERY_RATE`
 allows a lower correlation."""
 
 FALSE_POSITIVE_RATE = 0.01
-"""Besides `MIN_CORRELATION`, there is a second minimum of the correlation, set so that chance
-matches at most this fraction of the pixels. Matches between unrelated rows show how high chance
-correlations are. Chosen on the data sets that the module names."""
+"""Besides `MIN_CORRELATION`, a second minimum of the correlation lets at most this fraction of the
+pixels match by chance, as measured on unrelated rows. Chosen on Oxford and others."""
 
 FALSE_DISCOVERY_RATE = 0.01
-"""Matches with a correlation below `MIN_CORRELATION` or the minimum of `FALSE_POSITIVE_RATE` are
-kept as well if chance explains at most this fraction of all kept matches. The geometry does not
-rely on them. Chosen on the data sets that the module names."""
+"""Matches below the minimum correlations are kept as well, but geometry does not rely on them, if
+chance explains at most this fraction of all kept matches. Chosen on Oxford and others."""
 
 NULL_FRACTION = 0.25
 """This fraction of the rows is matched with unrelated rows, to measure chance. Chosen by hand."""
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
-"""The rows of tracked corners are compared with the epipolar lines of the refined matrix. The
-images are rectified again unless the second fraction of the corners, or more, lies within the first
-distance of the lines. Chosen on the data sets that the module names."""
+"""The images are rectified again if fewer than the second fraction of the tracked corners have
+their rows within the first distance of the refined epipolar lines. Chosen on Oxford and others."""
 
 MAX_RANGE_EXCESS = 1.25
 """Scaled-down images are also rectified again if the searched range was more than this many times
-the range of the disparities found. Chosen on the data sets that the module names."""
+the range of the disparities found. Chosen on Oxford and others."""
 
 MIN_SIGMA_PX = 0.1
-"""Minimum standard deviation in pixels that is assumed for the positions of tracks and of sparse
-matches. Chosen on the data sets that the module names."""
+"""Minimum assumed sigma of the errors of tracks and sparse matches. Chosen on Oxford and others."""
 
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
-"""Maximum number of corners that are tracked, and the side in pixels of the windows around them.
-Chosen on the data sets that the module names."""
+"""Maximum number of tracked corners, and side of their windows. Chosen on Oxford and others."""
 
 MAX_TRACK_PX = 4.0
-"""A track is wrong if it ends farther than this from the match that row matching gives. Chosen on
-the data sets that the module names."""
+"""Maximum distance of a track's end from the match on its row. Chosen on Oxford and others."""
 
 MIN_TRACKS = 50
-"""A pair with fewer tracked corners gets no dense matches. Chosen on the data sets that the module
-names."""
+"""A pair with fewer tracked corners gets no dense matches. Chosen on Oxford and others."""
 
 NEAR_PLANE_FRACTION = 0.8
-"""If too few corners can be tracked with the disparity range of all sparse matches, the range is
-reduced to that of this fraction of them, those nearest to a known plane. Anything far in front of
-the plane is then lost."""
+"""If too few corners can be tracked, the disparity range is reduced to that of this fraction of the
+sparse matches, those nearest to a known plane. Content far in front of the plane is then lost."""
 
 MAX_DISAGREEMENT_PX = 3.0
-"""A sparse match agrees with the disparity at its start if its own disparity differs by less than
-this, in pixels. It need not agree better, because it was found in images of another scale. Chosen
-on the data sets that the module names."""
+"""A sparse match agrees with the disparity at its start if its own differs by less than this. The
+limit is loose, because sparse matches come from another scale. Chosen on Oxford and others."""
 
 MIN_AGREEMENT = 0.6
 """This fraction or more of the sparse matches must agree with the disparities. On facades, a
@@ -122,10 +110,10 @@ quarter of the sparse matches end at the next window on the epipolar line."""
 class RectifiedView:
     """Two rectified images and the disparities between them.
 
-    `views` are the images in the `frame`, after scaling by `scale`. They and the following arrays
-    are (H, W). `searched` is the range of disparities that was tried. `disparity` is NaN where no
-    match is kept. `relied` marks the matches that geometry may rely on. `correlation` is the local
-    ZNCC of the first view and the second view shifted by the disparity.
+    `views` are the images, scaled by `scale`, in the `frame`. `searched` is the range of
+    disparities that was tried. `disparity` is NaN where no match is kept. `relied` marks matches
+    that geometry may rely on. `correlation` is the local ZNCC of the first view with the second
+    view at its disparity. All arrays are (H, W).
     """
 
     frame: RectifiedFrame
@@ -207,7 +195,7 @@ def rectified_view(
 ) -> RectifiedView | None:
     """Rectify both images, scaled down if there is too much to search, and match their rows.
 
-    Callers leave `scale` out. The function sets it when it calls itself with scaled-down images.
+    Only the function itself sets `scale`, when it calls itself with scaled-down images.
     """
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     frame = rectified_frame(*sparse, fundamental, *sizes, plane)
@@ -224,13 +212,11 @@ def rectified_view(
         plane = None if plane is None else scaled_homography(plane, scale, scale)
         return rectified_view((small0, small1), (points0, points1), fundamental, plane, scale)
     (first, valid0), (second, valid1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
-    # In a polar frame, all points move away from the epipole or all towards it. A small copy also
-    # gives disparities of the other sign, which are wrong, so only sparse matches give the range.
+    # A small copy of a polar frame also gives disparities of the wrong sign, so it is not searched.
     seen = None if isinstance(frame, PolarFrame) else find_disparity_range(first, second)
     if seen is not None:
         widened = min(low, seen[0]), max(high, seen[1])
-        # The range from the small copy may be far off if much of the frame is empty. It is used
-        # only if the images can be searched over it at this size.
+        # The range of the small copy may be far off, so it must be searchable at this image size.
         if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
             low, high = widened
     widest = frame.size[0] - 1
@@ -238,8 +224,7 @@ def rectified_view(
     if searched[0] >= searched[1]:
         return None
     disparity, matched, correlation = _match_rows((first, second), (valid0, valid1), searched)
-    # Some rows are matched with unrelated rows of the second view, over as many disparities. All
-    # matches found there are due to chance.
+    # Some rows are matched with unrelated rows of the second view: all these matches are chance.
     height = len(first)
     count = max(1, round(height * NULL_FRACTION))
     rows = (height - count) // 2 + np.arange(count)
@@ -257,10 +242,7 @@ def rectified_view(
 def _match_rows(
     views: Pair, shown: Pair, searched: DisparityRange
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the disparities, which of them match content of both views, and their correlation.
-
-    All are (H, W). The correlation is -1 where nothing is matched.
-    """
+    """Return (H, W) disparities, where they are matched, and correlations (-1 if not matched)."""
     rows = compute_disparity(*views, replace(DISPARITY, disparity_range=searched))
     row, column = np.indices(rows.disparity.shape, dtype=np.float32)
     x = np.where(rows.matched, column - rows.disparity, -1).astype(np.float32)
@@ -288,8 +270,7 @@ def _correlation_bounds(
     null = np.sort(null)[::-1]
     allowed = int(FALSE_POSITIVE_RATE * null_pixels)
     high = max(MIN_CORRELATION, float(null[allowed]) if len(null) > allowed else -1.0)
-    # If chance gives hardly any matches and the pair gives many, matches of low correlation are
-    # credible: on smooth surfaces, the disparity comes from the surroundings.
+    # Matches of low correlation are credible if chance gives hardly any matches and the pair many.
     ordered = np.sort(correlations)
     bounds = np.append(-1.0, null[::-1])
     matches = len(ordered) - np.searchsorted(ordered, bounds)
@@ -323,9 +304,8 @@ def _is_range_too_wide(view: RectifiedView) -> bool:
 def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
     """Track corners to the second view, starting from the matches of the rows.
 
-    Returns the positions of the corners in both images at full size, and the positions that the
-    tracks would have in the second image if they ended on the row where they start, as row matching
-    assumes. Returns None with fewer than `MIN_TRACKS` tracks.
+    Returns the corners in both images at full size, and the ends of their tracks moved to the rows
+    where the tracks start, as row matching assumes; None with fewer than `MIN_TRACKS` tracks.
     """
     first, second = (equalise(gray) for gray in view.views)
     mask = view.relied.astype(np.uint8)
@@ -364,8 +344,8 @@ def _refine(
 def _agreement(view: RectifiedView, sparse: Pair) -> float:
     """Return the fraction of sparse matches that agree with the disparity where they start.
 
-    Sparse matches that start where geometry relies on no disparity are not counted. The others are
-    independent of the rows: if most disagree, rows were matched to similar but wrong places.
+    Matches that start where geometry relies on no disparity are left out. If most of the others
+    disagree, rows were matched to similar but wrong places.
     """
     positions = [view.to_frame(points, side) for side, points in enumerate(sparse)]
     inside, column, row = view.pixels_of(positions[0])

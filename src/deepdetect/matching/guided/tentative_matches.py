@@ -30,16 +30,14 @@ MAX_KEYPOINTS = 4000
 """Maximum number of keypoints that are detected in each image. Chosen by hand."""
 
 MIN_POINTS = 1000
-"""Multi-scale keypoints from the caller replace SIFT keypoints if each image has at least this
-many. There may be fewer, because the user chooses their number. Chosen by hand."""
+"""Multi-scale keypoints of the caller replace SIFT if each image has this many. Chosen by hand."""
 
 MAX_RATIOS = (0.85, 0.8)
 """Limits of the ratio test, tried in this order. The second limit gives fewer matches but a smaller
 fraction of wrong ones, so it may show a geometry that the first does not show. Chosen by hand."""
 
 MIN_SEPARATION_PX = 2.0
-"""Only one of several matches that start, or end, in one square cell of this side is kept. Chosen
-by hand."""
+"""Only one match per square cell of this side is kept in each image. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +49,7 @@ class TentativeMatches:
         scales: scales of the views relative to the full-size images, at most 1.
         features: keypoints of the views, with their descriptors.
         matched: (M, 2) positions of the matches in each view.
-        ratios: (M,) ratios of the match's descriptor distance to that of the second-best match.
+        ratios: (M,) ratios of the descriptor distances to the best and to the second-best match.
     """
 
     views: tuple[np.ndarray, np.ndarray]
@@ -119,9 +117,8 @@ def find_tentative_matches(
 def matches_of_points(grays: Pair, points: tuple[Keypoints, Keypoints]) -> TentativeMatches | None:
     """Match the best multi-scale keypoints that the caller gives, with learned descriptors.
 
-    If the light differs between the images, or one is blurred, these keypoints give two to five
-    times as many correct matches as SIFT's. Returns None if either image has fewer than
-    `MIN_POINTS`, or if sizes or angles are missing.
+    In different light or under blur, they give two to five times as many correct matches as SIFT.
+    Returns None if an image has fewer than `MIN_POINTS`, or if sizes or angles are missing.
     """
     if min(len(each) for each in points) < MIN_POINTS:
         return None

@@ -1,11 +1,10 @@
 """Verification of matches: whether patches look the same once the two images are aligned.
 
 The second image is warped into the frame of the first. At each point, SIFT descriptors of both
-images, in two sizes, are compared by their correlation. The mean descriptor is subtracted first,
-because it is common to all patches. Null pairs are pairs of unrelated patches: the warped image is
-shifted by a third of its size or more. They show how similar patches that do not match are in these
-images. A point passes if its descriptors, averaged with those of its neighbours, are more similar
-than those of nearly all null pairs, and if most points around it pass. To save time, descriptors
+images, in two sizes, are compared by their correlation, after the mean of all descriptors is
+subtracted. Null pairs are unrelated patches, from a warped image that is shifted by a third of its
+size or more. A point passes if its distance (1 - correlation), averaged over its neighbours, is
+below that of nearly all null pairs, and if most points around it pass. To save time, descriptors
 are computed only at the points of a lattice that are nearest to the keypoints.
 """
 
@@ -20,28 +19,25 @@ from ...features.sift import correlation_distance, dense_sift, sift_gradient, to
 from ...geometry.images import gaussian_means, window_sums
 
 DESCRIPTOR_REACH = 36
-"""Radius in pixels of the area that the largest descriptor depends on, including gradient and blur.
-At points farther than this from the image border, shifting the image shifts the descriptors and
-does not change them, so they are computed only once."""
+"""Radius of the area on which the largest descriptor depends. Farther than this from the border, a
+shift of the image leaves descriptors unchanged, so they are computed only once."""
 
 KEYPOINT_SIZES_PX = (3.0, 8.0)
 """Descriptors are compared at these keypoint diameters. Chosen by hand."""
 
 LATTICE_PX = 3
-"""Spacing in pixels of the lattice points at which descriptors are computed. Pixels in between have
-nearly the same descriptors."""
+"""Spacing of the lattice of descriptors. Pixels in between have nearly the same descriptors."""
 
 FALSE_POSITIVE_RATE = 0.01
 """Fraction of null pairs (unrelated patches of the two images) that pass. This bound and the sizes
 of the windows were chosen on nine pairs of Oxford with parts of their second images covered."""
 
 SMOOTHING_SIGMA_PX = 2.5
-"""Sigma in pixels of the Gaussian weights with which the distances of neighbouring points are
-averaged. Chosen by hand."""
+"""Sigma of the Gaussian average over distances of neighbouring points. Chosen by hand."""
 
 WINDOWS_PX = (101, 31)
-"""Sides of two square windows around a point, which passes if most points in each window pass. The
-smaller one is against chance matches around a small plane. It was chosen on six synthetic pairs."""
+"""A point passes if most points in each of two square windows around it pass. The smaller window,
+chosen on six synthetic pairs, is against chance matches around a small plane."""
 
 MIN_SUPPORT = 0.5
 """A point passes only if at least this fraction of the points in each window around it passes."""
@@ -50,15 +46,14 @@ NULL_SHIFTS = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shifts between the patches of a null pair, as fractions of width and height."""
 
 NULL_BLOCK_PX = 64
-"""Null pairs are taken from blocks of the image with this side. Chosen by hand."""
+"""Null pairs come from whole blocks of this side: neighbours are averaged. Chosen by hand."""
 
 MAX_NULL_BLOCKS = 256
-"""Maximum number of random blocks for each shift. Images of up to a megapixel have no more blocks
-than this, so all of them are used."""
+"""Maximum number of random blocks per shift. Images of up to a megapixel have no more blocks."""
 
 MIN_POINTS_OF_MEAN = 100
-"""The mean descriptor is subtracted only if it is a mean of at least this many, because a mean of
-few descriptors is close to each of them."""
+"""The mean descriptor is subtracted only if it is the mean of at least this many descriptors,
+because a mean of few is close to each of them."""
 
 MIN_NULL_DISTANCE = 1e-6
 """The distance of equal descriptors is 0, except for rounding errors of at most this."""
@@ -69,9 +64,8 @@ class NullPairs:
     """Points of the first image paired with unrelated places of the second, for one shift.
 
     `rows`, (N,), are indices of described points, and `partners`, (N, 2), their unrelated places in
-    the second image before the shift. `shifted` is the second image, shifted cyclically. Both ends
-    of `interior` pairs are so far from the image border that their descriptors are the same with
-    and without the shift. In all other pairs, the border cuts the patches of both images.
+    the second image before the shift. `shifted` is the second image, shifted cyclically. `interior`
+    marks pairs so far from the border that the shift does not change their descriptors.
     """
 
     rows: np.ndarray
@@ -86,10 +80,9 @@ def dissimilarity(
     """Compare the patches of two aligned images around (N, 2) integer `pixels`.
 
     `warped` is the second image in the frame of the first, `gray0`, with content where `valid`.
-    Returns (N,) float32: 1 - correlation, averaged over neighbours, divided by the bound below
-    which the fraction `FALSE_POSITIVE_RATE` of the null pairs lies. Two patches match if the result
-    is below 1. It is infinite where there is no content, where most points around are dissimilar,
-    and everywhere if all null pairs look the same.
+    Returns (N,) float32: 1 - correlation, averaged over neighbours, divided by the
+    `FALSE_POSITIVE_RATE` quantile of the null pairs. Patches match if it is below 1. It is infinite
+    without content, if most points around differ, or if all null pairs look the same.
     """
     pixels = np.asarray(pixels).astype(np.int64)
     result = np.full(len(pixels), np.inf, np.float32)
@@ -126,13 +119,10 @@ def sample_null_pairs(
 ) -> list[NullPairs]:
     """For each shift, pair points in random blocks with unrelated places of the second image.
 
-    `points` are the (N, 2) described points; for the other arguments see `dissimilarity`. The
-    unrelated places lie where the second image has content. In images of up to a megapixel all
-    blocks are used, so the seed has no effect.
+    `points` are the (N, 2) described points; for the other arguments see `dissimilarity`.
     """
     size = np.array(warped.shape[::-1])
-    # The shifts and the period of the cyclic shift are multiples of the step. Most partners then
-    # lie on the lattice, where one descriptor serves all shifts.
+    # Shifts by multiples of the lattice step keep most partners on the lattice of descriptors.
     step = LATTICE_PX
     period = np.maximum(size // step, 1) * step
     rows_and_columns = [np.arange(length) for length in warped.shape]
@@ -205,10 +195,7 @@ def _lattice_near(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
 
 
 def _sample_blocks(pixels: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Return, for each shift, the indices of the points in randomly chosen blocks.
-
-    Whole blocks are used, because the results of neighbouring points are averaged.
-    """
+    """Return, for each shift, the indices of the points in randomly chosen blocks."""
     block = pixels // NULL_BLOCK_PX
     number = block[:, 1] * 1_000_000 + block[:, 0]
     order = np.random.default_rng(seed).permutation(np.unique(number))

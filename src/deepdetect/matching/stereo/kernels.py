@@ -12,8 +12,7 @@ import numpy as np
 from ..._shared.kernels import compiled
 
 END = np.uint16(30000)
-"""Cost of the places beside the smallest and the largest disparity of a path. It is above any sum,
-and low enough that adding a penalty to it stays below 2^16."""
+"""Cost of disparities outside the range: above any sum, and below 2^16 after adding a penalty."""
 
 BLOCK = 128
 """Number of pixels of a row that are processed together, so that the sums stay in the L1 cache."""
@@ -100,9 +99,9 @@ def _step(before, least, cost, total, after, p1, p2):  # type: ignore[no-untyped
     """Advance one pixel along a path, and return the lowest cost there.
 
     `before` and `after`, (D + 2,) uint16, are the costs of the path at the previous pixel and at
-    this pixel, with `END` on both sides. `least` is the lowest of `before`, and `cost`, (D,) uint8,
-    holds the matching costs of this pixel. The new costs of the path are added to `total`. `p1` is
-    the penalty for a disparity that changes by one, `p2` the penalty for a larger change.
+    this one, with `END` on both sides. `least` is the lowest of `before`. `cost`, (D,) uint8, holds
+    the matching costs of this pixel. The costs of the path are added to `total`. `p1` is the
+    penalty for a disparity that changes by one, `p2` the penalty for a larger change.
     """
     count = cost.shape[0]
     jump = np.uint16(least + p2)
@@ -122,12 +121,10 @@ def _step(before, least, cost, total, after, p1, p2):  # type: ignore[no-untyped
 def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # type: ignore[no-untyped-def]
     """Add to `total` the costs along the paths `first` to `last - 1` of one direction.
 
-    Each step goes one pixel `down` (1), up (-1) or along its row (0), and one pixel to the `right`
-    (1), to the left (-1) or straight (0). Paths along rows are numbered by their row, all others by
-    the column where they start. A diagonal path that leaves the image at one side continues at the
-    other side, in its next row. So there are as many paths as columns, and each belongs to one
-    call. `p1` is the penalty for a disparity that changes by one. `p2` has the penalty for a larger
-    change, for each difference of grey levels.
+    `down` and `right` are 1, -1 or 0: the step from pixel to pixel. Paths along rows are numbered
+    by their row, all others by the column where they start. A diagonal path that leaves the image
+    at one side continues at the other, so there are as many paths as columns. `p1` is the penalty
+    for a disparity that changes by one, `p2[g]` for a larger change where grey levels differ by g.
     """
     height, width, count = cost.shape
     paths, steps = last - first, height if down else width
@@ -216,9 +213,9 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
 def smooth_rows(first, last, disparity, radius, max_difference, out):  # type: ignore[no-untyped-def]
     """Write for each pixel the mean disparity of the surface that it lies on, within a window.
 
-    `disparity` is padded by `radius`. Two pixels on opposite sides of the centre count only
-    together, if both differ from it by at most `max_difference`. So a slanted plane keeps its
-    disparity, also next to an edge.
+    `disparity` is padded by `radius`. Two pixels on opposite sides of the centre count only if the
+    disparities of both differ from the centre's by at most `max_difference`. So a slanted plane
+    keeps its disparity, also next to an edge.
     """
     width = out.shape[1]
     total, weight = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -275,10 +272,9 @@ def step_rows(  # type: ignore[no-untyped-def]
     """Write the disparity after one Lucas-Kanade step along the row.
 
     In each window, gain * (values - change * slopes) + offset is fitted to the left grey values,
-    and `change` is added to the disparity. Only pixels of the same surface are used, whose
-    disparity differs by at most `max_difference` from that of the centre. All inputs are padded by
-    `radius`; `sample_rows` gives `values` and `slopes`. The change is damped where slopes are below
-    `noise`, and zero where the gain is below `min_gain`.
+    and `change` is added to the disparity. Only pixels whose disparity differs from the centre's by
+    at most `max_difference` are used. All inputs are padded by `radius`; `sample_rows` gives
+    `values` and `slopes`. Slopes below `noise` damp the change; a gain below `min_gain` makes it 0.
     """
     width = out.shape[1]
     n, p, v, s, vv, ss, vs, pv, ps = np.empty((9, BLOCK), np.float32)
@@ -290,8 +286,7 @@ def step_rows(  # type: ignore[no-untyped-def]
             # The grey level of the centre is subtracted: sums stay small and exact.
             middle = left[row, column : column + count]
             other = values[row, column : column + count]
-            # These are sums over the window: of 1 for each pixel (n), the left grey level (p), the
-            # right grey level (v), the slope (s), and of products of two of these.
+            # Sums over the window: count (n), left and right grey (p, v), slope (s), products.
             for total in (n, p, v, s, vv, ss, vs, pv, ps):
                 total[:] = 0
             for j in range(-radius, radius + 1):
@@ -350,9 +345,9 @@ def extrapolate_rows(  # type: ignore[no-untyped-def]
 ):
     """Extrapolate the first known surface of each row to the left, outside the other view.
 
-    `carried` holds integer disparities, which semi-global matching has carried over from the
-    surfaces around. The other view shows column x at x - sign * disparity, where `sign` is 1, or -1
-    for mirrored views. `out` is written only where the surface is extrapolated.
+    `carried` holds integer disparities of semi-global matching, which continue surrounding
+    surfaces. The other view shows column x at x - sign * disparity, where `sign` is 1, or -1 for
+    mirrored views. `out` is written only where the surface is extrapolated.
     """
     width = disparity.shape[1]
     sums = np.zeros((4, width + 1), np.float64)

@@ -45,20 +45,17 @@ OCCLUSION_SLACK_PX = 8
 difference of disparity, because windows reach over both ends of the gap."""
 
 MIN_SUPPORT_PX = 5
-"""A line that extrapolates a surface, or checks such a line, is fitted to at least this many known
-pixels. Chosen by hand."""
+"""Lines that extrapolate a surface are fitted to at least this many pixels. Chosen by hand."""
 
-# If the caller gives no range of disparities, it is searched on a copy of the pair with this width
-# and this limit for patches. With the following values, the range covers all of the Motorcycle pair
-# and of the Middlebury scenes of the benchmark, and is not much wider.
+# If no range is given, it is searched on a copy of this width, without patches up to this area. The
+# range then just covers the Motorcycle pair and the Middlebury scenes of the benchmark.
 SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX = 160, 50
 SEARCH_UNIQUENESS_RATIO = 1.3
 """Any other match on the row of the small copy must cost at least this many times as much as the
 best match. False matches rarely reach this ratio."""
 
 TAIL_FRACTION = 0.01
-"""This fraction of the disparities is ignored at each end of their range, because they may be
-wrong. Chosen by hand."""
+"""This fraction of disparities at each end of the range counts as unreliable. Chosen by hand."""
 
 SEARCH_MARGIN_PX = 1.5
 SEARCH_MARGIN_FRACTION = 0.2
@@ -76,16 +73,15 @@ class DisparityOptions:
             estimated from the pair.
         uniqueness_ratio: a disparity is kept if the lowest cost of any other match on the row,
             divided by the cost of its own match, is at least this.
-        discontinuity_margin_px: disparities within this distance in pixels of a disparity
-            discontinuity are dropped, because windows reach that far and give pixels beside a near
-            object the disparity of the object. Objects up to twice as wide vanish. 0 drops nothing.
+        discontinuity_margin_px: disparities within this distance of a disparity discontinuity are
+            dropped, because windows reach that far and give pixels beside a near object the
+            disparity of the object. Objects up to twice as wide as this vanish. 0 drops nothing.
         fill_occlusions: whether pixels that the right image does not show get the disparity of the
-            surface next to them. In a gap between two surfaces this is the farther surface, if the
-            row and the column of the pixel give the same disparity. For pixels that lie outside the
-            right image, the first visible surface is extrapolated along a line, as far as the line
-            predicts the surface itself and nothing above or below contradicts. Filled pixels have
-            no match (`DisparityMap.matched`). The outermost pixels of nearer surfaces are dropped,
-            because windows often give the nearer disparity to pixels of the farther surface there.
+            surface next to them. In a gap between two surfaces, this is the farther surface, if
+            filling along the row and along the column agree. Outside the right image, the first
+            visible surface is extrapolated along a line, as far as the line can be trusted. Filled
+            pixels have no match (`DisparityMap.matched`). The outermost pixels of nearer surfaces
+            are dropped, because they often belong to the farther surface.
 
     Raises:
         OptionError: a value is out of its range.
@@ -137,9 +133,8 @@ class DisparityMap:
     Attributes:
         disparity: (H, W) float32 in pixels: pixel (x, y) of the left view matches (x - disparity,
             y) in the right view. NaN where no disparity is reliable.
-        matched: (H, W) bool, true where both views show the pixel, so that (x - disparity, y) lies
-            in the right view. False where the disparity is NaN, or was filled in from a surface
-            next to it because the pixel is hidden in the right view or lies outside it.
+        matched: (H, W) bool, true where both views show the pixel. False where the disparity is
+            NaN, or was filled in because the right view does not show the pixel.
         disparity_range: smallest and largest disparity that were tried; None if the range was to be
             estimated and the views agree nowhere.
     """
@@ -189,13 +184,12 @@ def disparity_map(
 
     The method is semi-global matching of census transforms. A disparity is kept if both views
     agree, no other place on the row is as good, and it is neither in a small isolated patch nor
-    near a disparity discontinuity. It is then refined to sub-pixel accuracy. The light may differ
-    between the views. No detector is used; for rectified pairs `reconstruct` samples this map at
-    keypoints.
+    near a disparity discontinuity. Kept disparities are refined to sub-pixel accuracy. The light
+    may differ between the views. For rectified pairs, `reconstruct` samples this map.
 
     Args:
-        image0, image1: the left and the right image, of the same size, anything `load_image` takes;
-            only their luma is used.
+        image0, image1: the left and the right image, of the same size, in any form that
+            `load_image` accepts; only their luma is used.
         options: how disparities are found, and which are kept; `DENSE` keeps as many as possible.
         channels: order of the colours in arrays: "rgb", or "bgr" as in OpenCV.
 
@@ -315,8 +309,7 @@ def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) 
 def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
     """Return which pixels are within `distance_px` of a disparity discontinuity, (H, W) bool.
 
-    A window there covers two surfaces, and gives pixels beside the nearer surface the disparity of
-    that surface. Unknown pixels count as part of the farther surface on both sides of their row.
+    Unknown pixels count as part of the farther of the known surfaces left and right of them.
     """
     filled = fill_occlusions(disparity, known)[0]
     beside = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -328,8 +321,7 @@ def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: in
 def on_occluding_edge(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
     """Return which known pixels of nearer surfaces are within `distance_px` of a farther one.
 
-    Windows also give the nearer disparity to pixels just outside the nearer surface, so these
-    pixels are the least reliable. Unknown pixels count as part of the farther surface beside them.
+    Unknown pixels count as part of the farther of the known surfaces left and right of them.
     """
     filled = fill_occlusions(disparity, known)[0]
     farthest = cv2.erode(filled, _square(distance_px))
@@ -367,11 +359,10 @@ def extrapolate_disparity(
 ) -> np.ndarray:
     """Extrapolate the first and the last known surface of each row to the border; NaN elsewhere.
 
-    Only pixels whose match would lie outside the right image are extrapolated, because pixels
-    inside have matches of their own. The disparity must also agree with `carried`, which
-    semi-global matching has chosen. A line is fitted to the surface. It is trusted up to n pixels
-    beyond the edge of the surface if, at this edge, a line fitted to pixels n to 2 n of the surface
-    agrees with a line fitted to the first n pixels to within `MAX_DIFFERENCE_PX`.
+    Only pixels whose match would lie outside the right image are extrapolated, along a line fitted
+    to the surface. The surface must agree with `carried`, the result of semi-global matching. The
+    line is trusted up to n pixels beyond the edge of the surface if, at the edge, lines fitted to
+    its first n and to its next n pixels agree to within `MAX_DIFFERENCE_PX`.
     """
     from .kernels import extrapolate_rows
 

@@ -57,12 +57,11 @@ P2_HALF_GRADIENT_LEVELS = 8
 MIN_P2_BITS = 1.25 * P1_BITS
 
 OUTSIDE_COST = 0.6
-"""Cost of a match outside the right image, on a scale where the median match of the pair costs 0
-and a wrong match 1. Because the cost is in between, a surface that leaves the image is continued
-from its neighbours. With a lower cost, more content at the border is lost in noisy views."""
+"""Cost of a match outside the right image, if the pair's median match costs 0 and a wrong match 1.
+It lets surfaces continue there; a lower cost loses more of the border in noisy views."""
 
 MAX_DIFFERENCE_PX = 1.0
-"""Neighbouring disparities that differ by more are on different surfaces. Chosen by hand."""
+"""Disparities of neighbours on one surface differ by at most this. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
 """Radius in pixels of the windows in which the grey values are fitted. It and the next five values
@@ -73,8 +72,7 @@ SMOOTHING_RADIUS_PX = 4
 iteration of the fit, to reduce the bias of the parabola."""
 
 FINAL_SMOOTHING_RADIUS_PX = 2
-"""Radius in pixels of the window in which the disparities of one surface are averaged after the
-last iteration of the fit."""
+"""Radius of the window of the average over disparities after the last iteration of the fit."""
 
 ITERATIONS = 2
 """Number of iterations of the fit of the grey values."""
@@ -87,8 +85,7 @@ MIN_GAIN = 0.2
 view. If it is lower, the right view shows something else, and the disparity is not refined."""
 
 UNKNOWN = np.float32(1e9)
-"""Value that stands for an unknown disparity. It is so far from any other disparity that the two
-are never on the same surface."""
+"""This value stands for an unknown disparity: it is too large to share a surface with any other."""
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -113,10 +110,7 @@ class SGMResult(NamedTuple):
 def semi_global_matching(
     left: np.ndarray, right: np.ndarray, disparities: DisparityRange
 ) -> SGMResult:
-    """Match every pixel of the left view along its row; both views are (H, W) uint8 luma.
-
-    A parabola makes the disparities sub-pixel, but they still cluster around integers.
-    """
+    """Match every pixel of the left view along its row; both views are (H, W) uint8 luma."""
     height, width = left.shape
     count = -(-(disparities[1] - disparities[0] + 1) // LANES) * LANES
     censuses = census(left), census(right)
@@ -188,13 +182,11 @@ def is_textured(gray: np.ndarray) -> np.ndarray:
 def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
     """Return the median Hamming distance of a pair's matches in bits, measured on some rows.
 
-    A match here is a pair of pixels that have the least cost for each other, without sums along
-    paths. Noise increases its distance.
+    Matches here are pixels that have the least cost for each other, without sums along paths.
     """
     height = len(censuses[0])
     centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)
-    # Costs are sums over three rows, so three are needed for each sampled row. Matches outside the
-    # right view get the largest distance.
+    # Costs are sums over three rows. Matches outside the right view get the largest distance.
     rows = np.clip(centres[:, None] + [-1, 0, 1], 0, height - 1).ravel()
     tried = disparities[0], disparities[1] - disparities[0] + 1
     sampled = censuses[0][rows], censuses[1][rows]

@@ -26,8 +26,8 @@ HUBER_THRESHOLD_PX = 2.0
 """Huber's loss reduces the weight of residuals above this. Chosen by hand; not measured."""
 
 FOCAL_LENGTHS = np.geomspace(0.3, 10, 100) * 640 / UNIT_PX
-"""Start values of the focal length, in units of the fit: 0.3 to 10 times 640 px, which is the
-default longer side of the registered images."""
+"""Start values of the focal length in units of the fit: 0.3 to 10 times 640 px, the default longer
+side of the images for registration."""
 
 FOCAL_WEIGHT = 1e-4
 """Weight of the term that keeps all focal lengths equal: a difference of 10 % costs as much as a
@@ -178,9 +178,9 @@ def _normal_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return both sides of the normal equations.
 
-    `columns` gives the index of the first parameter of each image that is not fixed. `directions`
-    gives the (9, P) derivatives of the matrix E by the P parameters of the image, where E updates a
-    homography H to H (I + E).
+    A step changes each homography H to H (I + E). `directions` gives the (9, P) derivatives of E by
+    the P parameters of each image, `columns` the index of the first parameter of each image that is
+    not fixed.
     """
     count = sum(matrix.shape[1] for matrix in directions.values())
     normal, right = np.zeros((count, count)), np.zeros(count)
@@ -206,9 +206,9 @@ def _normal_equations(
 def _linearised(
     first: np.ndarray, second: np.ndarray, points: np.ndarray, targets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (M, 2) residuals in the second image and their derivatives by the E of each image.
+    """Return (M, 2) residuals in the second image, and their (M, 2, 9) derivatives for each image.
 
-    The derivatives are (M, 2, 9) for each of the two images; see `_normal_equations` for E.
+    The derivatives are by E, where a step changes a homography H to H (I + E).
     """
     between = np.linalg.inv(second) @ first
     homogeneous = np.column_stack([points, np.ones(len(points))])
@@ -245,7 +245,7 @@ def _rotations(homographies: Matrices, focal: float) -> tuple[dict[int, np.ndarr
 
 
 def _turns_and_focal(focal: float) -> np.ndarray:
-    """Return the (9, 4) derivatives of E by rotations about x, y, z and by the log focal length."""
+    """Return (9, 4) derivatives of E in H (I + E) by three rotations and the log focal length."""
     turns = np.zeros((4, 3, 3))
     turns[0, 1, 2], turns[0, 2, 1] = -focal, 1 / focal
     turns[1, 0, 2], turns[1, 2, 0] = focal, -1 / focal

@@ -1,7 +1,4 @@
-"""Place the images of a panorama on a plane, a cylinder or a sphere.
-
-The size and memory of a canvas are known before anything is drawn.
-"""
+"""Place the images of a panorama on a plane, a cylinder or a sphere."""
 
 from __future__ import annotations
 
@@ -36,8 +33,8 @@ MIN_WARP_SCALE = 0.67
 """Images drawn at a scale below this are blurred first, because they would alias otherwise."""
 
 MIN_SHOWN_PX = 16
-"""An image whose longer side is drawn with fewer pixels is blurred as if it had this many, because
-wider blurs take minutes."""
+"""An image whose longer side is drawn with fewer pixels than this is blurred as if drawn with this
+many, because wider blurs take minutes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +54,10 @@ class WarpedImage:
 class Canvas:
     """The boxes that images cover on a canvas, and the function that draws them there.
 
-    The keys of `boxes` are image numbers. If the border of a closed canvas splits an image, the
-    rest of it has a second box, with the key ~number. `draw(place, rgb, scale_of_image,
-    scale_of_canvas)` warps an image for the box with the key `place`. The scales are those of a
-    reduced copy of the image and of the canvas, 1 at full size. A `closed` canvas shows 360
-    degrees, so its right border continues at the left.
+    The keys of `boxes` are image numbers. A `closed` canvas shows 360 degrees, so its right border
+    continues at the left. If this border splits an image, the rest of the image has a second box,
+    with the key ~number. `draw(place, rgb, scale_of_image, scale_of_canvas)` warps an image for the
+    box with the key `place`. The scales are those of reduced copies, 1 at full size.
     """
 
     boxes: dict[int, Box]
@@ -248,7 +244,6 @@ def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
     For equal cameras that only rotate, a depth is proportional to the cosine of the angle between
     the corner and the optical axis of that camera. Beyond the horizon, depths are negative.
     """
-    # The factor of a homography is arbitrary. It is chosen so that the determinant is 1, as for a
-    # rotation, which gives depths their sign.
+    # A determinant of 1, as for a rotation, fixes the arbitrary factor and the sign of the depths.
     matrix = homography / np.cbrt(np.linalg.det(homography))
     return outer_corners(size) @ matrix[2, :2] + matrix[2, 2]

@@ -26,15 +26,14 @@ pixels of the small canvas. Chosen by hand."""
 
 SEAM_TOLERANCE_PX, SEAM_PERCENT = 1.0, 90.0
 """Parallax is reported if the displacements along a seam exceed the first value, in pixels of the
-small canvas, at the percentile given by the second. Smaller ones would be invisible on a screen."""
+small canvas, at the percentile given by the second. Smaller displacements are invisible."""
 
 MIN_FLOW_PX = 32
-"""Optical flow is computed only if both sides of an overlap have at least this many pixels. Chosen
-by hand; not measured."""
+"""Optical flow needs an overlap with at least this width and height. Chosen by hand."""
 
 GAIN_ERROR_STD, GAIN_PRIOR_STD = 0.05, 0.5
-"""The first is the standard deviation of the log brightness ratio of two images in their overlap,
-the second that of the log gain of an image. Both were chosen by hand."""
+"""Assumed standard deviations of the log brightness ratio of two images in their overlap, and of
+the log gain of an image. Chosen by hand."""
 
 
 def composite(
@@ -45,9 +44,9 @@ def composite(
     """Composite images on a canvas.
 
     `load` returns an image by its number, (H, W, 3) RGB, uint8 or uint16; it is called once per
-    box. `small` holds a reduced uint8 copy of each image, and its scale. Returns the panorama
-    (black outside all images, uint16 if any image is), its mask, the gain of each image, and the
-    displacement in pixels of the panorama of pairs with visible parallax along their seam.
+    box. `small` holds a reduced uint8 copy of each image, and its scale. Returns the panorama,
+    black outside all images and uint16 if any image is; its mask; the gain of each image; and, for
+    each pair with visible parallax, its displacement along the seam in pixels of the panorama.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
@@ -144,7 +143,7 @@ def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
 
 
 def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, float] | None:
-    """Return the mean brightness of both images in their overlap; None if it is too small."""
+    """Return the mean brightness of both images in their overlap; None for small overlaps."""
     parts = _overlap(first, second)
     shared = (first.mask[parts[0]] > 0) & (second.mask[parts[1]] > 0)
     if np.count_nonzero(shared) < MIN_OVERLAP_PX:
@@ -171,7 +170,7 @@ def _overlap(first: WarpedImage, second: WarpedImage) -> list[tuple[slice, slice
 def _parallax(
     low: Mapping[int, WarpedImage], gains: Mapping[int, float], seams: Mapping[int, np.ndarray]
 ) -> dict[tuple[int, int], float]:
-    """Find the pairs with visible parallax along their seam, and its displacement in pixels."""
+    """Return the displacement in pixels of each pair with visible parallax along its seam."""
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     found: dict[tuple[int, int], float] = {}
     for places in combinations(low, 2):
@@ -221,9 +220,7 @@ def _upscale_mask(seam: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def crop_box(valid: np.ndarray, whole_rows: bool = False) -> Box:
     """Return the largest rectangle of an (H, W) bool mask that is true everywhere.
 
-    If `whole_rows`, the rectangle has the full width, provided that any row is true everywhere. For
-    each row, the search tracks the height of the run of true pixels that ends in each column, and
-    how far that height extends sideways.
+    If `whole_rows` and any row is true everywhere, the rectangle has the full width.
     """
     if whole_rows and valid.all(axis=1).any():
         valid = np.repeat(valid.all(axis=1, keepdims=True), valid.shape[1], axis=1)

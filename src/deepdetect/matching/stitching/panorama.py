@@ -32,7 +32,7 @@ class StitchingOptions:
     """Scale, size limit and registration size of a panorama.
 
     Attributes:
-        scale: panorama pixels per image pixel at the centre of the reference.
+        scale: panorama pixels per image pixel at the centre of the reference image.
         max_canvas_megapixels: size limit of the panorama; a pixel takes 22 to 56 bytes of memory.
         registration_side: longer side in pixels to which images are reduced for registration.
 
@@ -65,13 +65,13 @@ class Panorama:
         reference: number of the undistorted image, or of the middle one of a curved panorama.
         unregistered: by image number, the reason why an image is not in the panorama.
         matches: number of dense matches of each registered pair.
-        residual_px: root mean square distance between the positions to which the homographies of
-            pairs and those of the panorama map matched keypoints, in pixels of the images reduced
-            for registration; 0 for a flat panorama without closed loops.
+        residual_px: RMS difference between each pair's own homography and the panorama's, at
+            matched keypoints, in pixels of the images reduced for registration; 0 for a flat
+            panorama without closed loops.
         gains: brightness factor of each image.
         seconds: time of each stage, by its name.
         parallax: displacement along the seam in panorama pixels, by the numbers of both images, for
-            pairs where it is visible because the camera moved.
+            pairs where it is visible because the camera moved between them.
         closed: whether the panorama shows 360 degrees, and its right border continues at the left.
     """
 
@@ -127,9 +127,9 @@ def stitch(
     Args:
         images: two or more images in any order, in any form that `load_image` accepts. Paths are
             loaded one at a time, so that only one full-size image is in memory.
-        detector: a `DeepDetect`, or another object with a method `heatmap`: SIFT keypoints then
-            find overlaps, and dense keypoints confirm them. Or a `PointDetector`, or another object
-            with only a method `detect`: its keypoints then do both. Default `DeepDetect()`.
+        detector: a `DeepDetect` or a `PointDetector`, or any object with a method `heatmap` or
+            `detect` like theirs. With heat maps, SIFT keypoints find overlaps and dense keypoints
+            confirm them; otherwise the points do both. Default `DeepDetect()`.
         channels: order of the colour channels in images that are arrays, as in `load_image`.
         projection: "plane" keeps lines straight; "cylindrical" and "spherical" need cameras that
             only rotated, and level the horizon.

@@ -1,10 +1,9 @@
 """Estimate homographies from many images to the frame of one.
 
 Sparse keypoints show which images overlap. These pairs are registered by guided matching, and dense
-keypoints must confirm them. The pairs with most matches form a spanning tree; homographies composed
-along it initialise a joint fit to all pairs. Pairs are matched again, starting from this fit, if
-they disagree with it, or if they overlap in it without having been registered. Then the joint fit
-is repeated.
+keypoints must confirm them. The pairs with most matches form a spanning tree. Homographies composed
+along the tree initialise a joint fit to all pairs. Pairs that disagree with this fit, or overlap in
+it but were not registered, are matched again starting from it, and the fit is repeated.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ SIFT_KEYPOINTS = 2000
 """Number of sparse keypoints per image to find overlaps. Chosen by hand; not measured."""
 
 MAX_KEYPOINTS = 30_000
-"""A homography is confirmed by at most this many dense keypoints per image. Chosen by hand."""
+"""Maximum number of dense keypoints per image that confirm a homography. Chosen by hand."""
 
 MIN_PARTNERS = 3
 """A pair is not registered if other pairs already connect its images and each image has at least
@@ -43,18 +42,16 @@ MIN_OVERLAP = 0.1
 keypoints into the other image. Chosen by hand; not measured."""
 
 MAX_FURTHER_TRIALS = 2
-"""If dense matches reject a geometry, up to this many others are tried, each of which takes
-time."""
+"""If dense matches reject a geometry, up to this many others are tried, which takes time."""
 
 MAX_DISAGREEMENT_PX = 2.0
-"""A registered pair is registered again if the root mean square distance between its homography and
-the joint fit is larger. Chosen by hand."""
+"""A pair whose RMS distance from the joint fit exceeds this is tried again. Chosen by hand."""
 
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MAX_CAMERA_RESIDUAL_PX = 3.0
-"""Cameras that only rotate have smaller RMS residuals: 0.2 to 1 px without parallax."""
+"""Maximum RMS residual of cameras that only rotate; it is 0.2 to 1 px without parallax."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +188,7 @@ def _registered_pairs(
         for _ in range(MAX_FURTHER_TRIALS):
             if pair is not None or geometry.matrix is None:
                 break
-            # On repeated structure (windows), most keypoints may agree on a wrong geometry. So
-            # another is estimated from those that disagree with it.
+            # Most matches on repeated structure may be wrong, so the others are tried alone.
             tentative = tentative.apart_from(geometry.matrix)
             geometry = estimate_initial_geometry(tentative, "homography", seed)
             pair = _register(views, first, second, geometry, seed)
@@ -228,10 +224,9 @@ def _registered_again(
 ) -> list[RegisteredPair]:
     """Register pairs again, starting from the joint fit, if they disagree with it or are missing.
 
-    On repeated or collinear structure (windows, towers), keypoints can give a wrong homography,
-    which dense matches reject or confirm only in part. The joint fit predicts the homography of a
-    pair from all other pairs. The new result replaces the old one if it has more matches. A
-    panorama of 360 degrees needs the pair that closes it, or its ends drift apart.
+    On repeated or collinear structure (windows, towers), keypoints can give a wrong homography. The
+    new result replaces the old one if it has more matches. A panorama of 360 degrees needs the pair
+    that closes it, or its ends drift apart.
     """
     known = {(pair.first, pair.second): pair for pair in pairs}
     partners: dict[int, set[int]] = {number: set() for number in to_common}
