@@ -34,8 +34,8 @@ SIZE = 96
 def quick_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small images are not enlarged to 480x480, nor are few matches counted 64 times."""
     monkeypatch.setattr(paper, "MANY_SEEDS", 1)
-    for module in ("evaluation.weights", "evaluation.options", "cli.evaluate"):
-        monkeypatch.setattr(f"deepdetect.{module}.PAPER_RESOLUTION_PX", SIZE)
+    for module in ("weights", "options"):
+        monkeypatch.setattr(f"deepdetect_lab.evaluation.{module}.PAPER_RESOLUTION_PX", SIZE)
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,8 @@
 """Engines that run the tasks of a collection: processes of this machine, or a Ray cluster.
 
 To add an engine, write a function with the signature of `map_in_processes` and add it to `ENGINES`.
-Ray repeats the tasks of a worker that dies, so the function may run twice for a task. The function
-must therefore write each file under a temporary name, and rename the complete file.
+Ray repeats the tasks of a worker that dies, so a task may run twice. What runs a task must
+therefore write each file under a temporary name, and rename it when it is complete.
 """
 
 from __future__ import annotations

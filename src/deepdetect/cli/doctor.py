@@ -18,7 +18,7 @@ from .._shared.opencv import import_opencv, installed_distributions, version_num
 from ._options import Result, command, table
 
 PURPOSES = {
-    "all": "the fast back end, ONNX files, the demo, HEIC, raw and compressed TIFF images",
+    "all": "the fast back end, ONNX files, the demo, HEIC, camera raw and compressed TIFF",
     "app": "the page in a browser",
     "sfm": "reconstruct with three or more images, extract, match-many, export, georeferences",
 }

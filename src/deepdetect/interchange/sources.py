@@ -202,7 +202,7 @@ def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pai
         raise OptionError(
             f"it is unclear which two images {path} is for: give their folder as `images`"
             if names is None
-            else f"{path} belongs to no two images in the folder `images`, or to several pairs: "
+            else f"{path} fits no pair of images below `images`, or more than one: "
             "give another folder"
         )
     return joined[0]

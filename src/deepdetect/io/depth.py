@@ -47,7 +47,7 @@ def save_depth_png(
 
 
 def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarray) -> None:
-    """Write `depth` (H, W) float32, NaN where unknown, its `unit`, and further arrays as npz."""
+    """Write `depth`, (H, W) float32 with NaN where unknown, its `unit`, and other arrays to npz."""
     known = np.isfinite(depth) & (depth > 0)
     stored = np.where(known, depth, np.nan).astype(np.float32)
     save_arrays(path, {"depth": stored, "unit": unit, **arrays})

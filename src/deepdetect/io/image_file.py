@@ -148,7 +148,7 @@ def read_with(options: ReadingOptions) -> Iterator[None]:
 
 
 def reading_options(**given: Any) -> ReadingOptions:
-    """Return the options that `read_with` set, but with the given values that are not None."""
+    """Return the options set by `read_with`, overridden by the given values that are not None."""
     return replace(_reading.get(), **{n: value for n, value in given.items() if value is not None})
 
 

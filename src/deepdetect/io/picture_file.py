@@ -145,7 +145,7 @@ class Metadata:
         tags += [(code, "s", 0, text, True) for code, text in texts.items()]
         directories = {code: exif.get_ifd(code) for code in EXIF_DIRECTORIES} if exif else {}
         directories = {code: each for code, each in directories.items() if _can_be_written(each)}
-        # tifffile writes no pointers to directories: `_append_directory` makes them of these tags.
+        # tifffile cannot write pointers to EXIF directories: `_append_directory` fills them in.
         tags += [(code - 1, "I", 1, 0, True) for code in directories]
         bands = bands[:, :, 0] if bands.shape[2:] == (1,) else bands
         colour = bands.shape[2:] == (3,) and bands.dtype in (np.uint8, np.uint16)

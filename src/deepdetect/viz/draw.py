@@ -222,7 +222,7 @@ def add_scale(
 
 
 def _caption(text: str, width: int, unit: float) -> np.ndarray:
-    """Return a black strip with a line of text that fits its width; `unit` is from `line_scale`."""
+    """Return a black strip with one line of text, shrunk to fit; `line_scale` gives `unit`."""
     strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
     room = width - round(2 * CAPTION_MARGIN * unit)
     if room <= 0:

@@ -83,7 +83,7 @@ def average_weights(paths: Sequence[str | Path]) -> nn.Module:
     for path, network in zip(paths, networks, strict=True):
         if type(network) is not type(networks[0]):
             raise WeightsError(
-                f"{path} has weights of another network than {paths[0]}: give files of one network"
+                f"{path} is for another network than {paths[0]}: give files for one network"
             )
     states = [network.state_dict() for network in networks]
     mean = {

@@ -93,6 +93,6 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
 
 
 def _reason(error: Exception) -> str:
-    """Return the line of a runtime's error that holds the reason; OpenVINO's is the last line."""
+    """Return the line of an engine's error message that gives the reason: OpenVINO's last one."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[-1] if lines[0].startswith("Exception from") else lines[0]

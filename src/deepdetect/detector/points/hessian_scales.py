@@ -27,9 +27,8 @@ LEAST_RESPONSE = 1e-8
 class ScaleSpace:
     """Smoothed copies of an image with values in [0, 1], and the determinants of their Hessians.
 
-    `smooth` holds the copies, `determinant` the scale-normalised determinants, (L, H, W) float32
-    each. `gray` is the mean of the image, rounded to a multiple of 1/255. `smooth` holds the
-    differences from this mean.
+    `gray` is the mean of the image, rounded to a multiple of 1/255. `smooth` holds the copies minus
+    `gray`, and `determinant` the scale-normalised determinants. Both are (L, H, W) float32.
     """
 
     gray: np.float32

@@ -55,8 +55,8 @@ The fraction is up to 0.27 for the planar scenes of Oxford, up to 0.40 for Strec
 and 0.48 or more for synthetic facades that repeat one window."""
 
 MIN_OVERLAP = 0.6
-"""A shift is tested only if the shifted images keep this fraction of the overlap, because content
-that contradicts the shift may lie outside the overlap."""
+"""A shift is tested only if at least this fraction of the overlap remains after it. With less, the
+content that would refute the shift may be out of view."""
 
 MIN_ZNCC, MIN_ZNCC_GAIN = 0.5, 0.2
 """A homography explains a place with a ZNCC above the first value. It alone explains the place if

@@ -71,7 +71,7 @@ class Canvas:
         return right, bottom
 
     def check_size(self, max_megapixels: float) -> None:
-        """Raise an OptionError if the canvas has no pixel, or needs more than is allowed or free."""
+        """Raise an OptionError if the canvas has no pixel, or is too large."""
         width, height = self.size
         if not (width and height):
             raise OptionError("at this `scale` the panorama has no pixel: make it larger")

@@ -227,7 +227,7 @@ def _plan(
     reference: int | None,
     scale: float,
 ) -> tuple[Canvas, dict[int, np.ndarray], int]:
-    """Return the canvas, the homographies of the panorama, and the number of the reference.
+    """Return the canvas, the homographies of the panorama, and the index of the reference image.
 
     `scales` are the factors by which images were reduced for registration, and `sizes` their full
     (width, height), by image number.

@@ -112,7 +112,7 @@ def onnx_feature(
 
 
 class _Network(NamedTuple):
-    """A loaded ONNX file. `shapes` has the shape of each input; a free dimension is not an int."""
+    """A loaded ONNX file. `shapes` has the shape of each input, no int where it is free."""
 
     shapes: list[list[Any]]
     outputs: list[str]

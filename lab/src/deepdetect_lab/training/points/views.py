@@ -40,8 +40,8 @@ MAX_ENLARGEMENT = 2.2
 """Zoomed views enlarge the photograph by at most this factor, because more would only show blur."""
 
 SUBTLE = 0.25
-"""Probability of a weak blur in views of a kind other than "blur". The same holds for weak changes
-of light and weak JPEG compression. Chosen by hand."""
+"""Probability that a view of another kind than "blur" is also blurred weakly. Weak changes of light
+and weak JPEG compression are added to views of other kinds likewise. Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),
