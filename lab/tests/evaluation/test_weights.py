@@ -97,7 +97,7 @@ def test_at_equal_density_weights_have_as_many_keypoints_as_the_labels(
 ) -> None:
     arguments = ("--oxford", folder, "--compare", "dense", "--equal-density", "--json")
     report = json.loads(run_evaluate(*arguments))
-    squashed = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
+    squashed = LabelDetector(heatmap_options=HeatmapOptions(SIZE))
     labels = evaluate_oxford(squashed, load_oxford(folder)).density[0.5]
     of_all = [*report["oxford"]["density"].values()]
     of_all += report["compare"][0]["oxford"]["density"].values()
