@@ -1,22 +1,40 @@
-"""Readers of camera files of other programs. A format is recognised by the content of the file.
+"""Reading of camera files: parsing, the table of formats, and OpenCV, ROS, KITTI and their like.
 
-All readers return a dictionary with the keys of calib.json, which the module `camera` describes.
+A format is recognised by the content of the file. All readers return a dictionary with the keys of
+calib.json, which the module `camera` describes; `camera_formats` has the readers of other families.
 """
 
 from __future__ import annotations
 
+import configparser
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
 from .._shared.errors import ReconstructionError
-
-Values = Mapping[str, Any]
+from . import camera_formats as formats
+from .camera_formats import (
+    HALF_PIXEL,
+    MATRICES,
+    MM_PER_M,
+    Size,
+    Values,
+    check_distortion,
+    check_model,
+    check_view,
+    matrix_at,
+    numbers_in,
+    only,
+    pair,
+    view_of,
+    view_of_matrix,
+)
 
 STEREO = (
     *(("P1", "P2", ""), ("M1", "M2", "D"), ("K1", "K2", "D")),
@@ -25,7 +43,6 @@ STEREO = (
 """Keys in OpenCV's files. A row has the keys of the left and the right camera matrix, and those of
 the distortion coefficients without the final 1 or 2. The first row is for rectified views."""
 
-MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "M1", "K1", "cameraMatrix1")
 PROJECTIONS = ("projection_matrix", "P", "p")
 DISTORTIONS = (
     *("distortion_coefficients", "Distortion_Coefficients", "distortion_coeffs", "distCoeffs"),
@@ -38,43 +55,48 @@ FILES_OF_PAIRS = (
 )
 """Names of the two files that ROS, OpenCV or EuRoC write to a folder for a stereo pair."""
 
-MM_PER_M = 1000.0
-
 MIN_BASELINE_MM = 10.0
 """OpenCV's files do not state the unit of lengths. A baseline is taken to be in metres if its
 number is smaller than this, else in mm. Chosen by hand."""
-
-COLMAP_CENTRE = 0.5
-"""The centre of the first pixel has this x and y in COLMAP. In this package they are 0."""
 
 NUMBERS = r"([-+.\deE \t;,\[\]]+)\r?$"
 COLMAP_LINE = re.compile(rf"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]{NUMBERS}", re.MULTILINE)
 TEXT_LINE = re.compile(rf"^[ \t]*(\w+)[ \t]*[:=]{NUMBERS}", re.MULTILINE)
 
+OWN_KEYS = (
+    *("focal_px", "cx", "cy", "width", "height", "baseline_mm", "disparity_offset_px"),
+    *("left", "right"),
+)
+
 KNOWN = (
-    "give a file of OpenCV, ROS, Kalibr, EuRoC, KITTI, Middlebury or COLMAP, a matrix of 3x3 "
-    'numbers, or JSON such as {"focal_px": 1000, "cx": 320, "cy": 240, "baseline_mm": 120}'
+    "give a file of a program that docs/files.md lists, a matrix of 3x3 numbers, or JSON such as "
+    '{"focal_px": 1000, "cx": 320, "cy": 240, "baseline_mm": 120}'
 )
 
 
-def read_camera_file(path: Path, views: tuple[int, int] | None = None) -> dict[str, Any]:
+def read_camera_file(
+    path: Path, image: Size = None, views: tuple[int, int] | None = None
+) -> dict[str, Any]:
     """Read a camera file, or a folder with two; return a dictionary with the keys of calib.json.
 
-    `views` are the numbers of the left and the right camera in a KITTI file, which has several.
+    `image` is the (width, height) of the first image, if it is known. `views` are the numbers of
+    the left and the right camera in a KITTI file, which has several. The key "format" of the result
+    says whose file it is, as the subject of a sentence.
 
     Raises:
         ReconstructionError: the format is unknown, or the cameras have distortion.
         OSError: the file cannot be read. Any other exception means that the file is damaged.
     """
     if not path.is_dir():
-        return _calib_json(_parsed(path.read_bytes()), views)
+        return _calib_json(_parsed(path.read_bytes()), image, views)
     for names in FILES_OF_PAIRS:
         if all((path / name).is_file() for name in names):
             first, second = (_parsed((path / name).read_bytes()) for name in names)
             if names[1] == "extrinsics.yml":
-                return _calib_json({**first, **second}, views)
-            left, right = _calib_json(first, None), _calib_json(second, None)
-            return {**left, "right": right["right"], "baseline_mm": _distance(first, second)}
+                return _calib_json({**first, **second}, image, views)
+            left, right = (_calib_json(each, image, None) for each in (first, second))
+            with _named(left["format"]):
+                return {**left, "right": right["right"], "baseline_mm": _distance(first, second)}
     wanted = ", or ".join(" and ".join(names) for names in FILES_OF_PAIRS)
     raise ReconstructionError(f"the folder does not contain {wanted}: give a file")
 
@@ -82,27 +104,58 @@ def read_camera_file(path: Path, views: tuple[int, int] | None = None) -> dict[s
 def _parsed(content: bytes) -> Values:
     """Parse a camera file, without `cv2.FileStorage`, which hangs or crashes on damaged files."""
     text = content.decode("utf-8", "replace").lstrip("\ufeff \r\n\t")
-    if text.startswith("{"):
-        return json.loads(text)
     if text.startswith("<"):
-        return _xml_values(ElementTree.fromstring(text))
-    numbers = _numbers(text)
-    if len(numbers) in (9, 12):
-        return {"camera_matrix": numbers}
+        root = ElementTree.fromstring(text)
+        ours = root.tag in ("calibration", "document", "chunk")
+        return {"metashape": root} if ours else _xml_values(root)
+    if text.startswith("# Bundle file"):
+        return {"bundler": _numbers(text.partition("\n")[2])}
+    lines = re.sub(r"^[ \t]*(#|//).*$", "", text, flags=re.MULTILINE).strip()
+    if numbers := _numbers(lines):
+        return _matrix_or_line(numbers, lines)
     if cameras := COLMAP_LINE.findall(text):
-        return {"cameras": [(model, _numbers(numbers)) for model, numbers in cameras]}
-    lines = {key: _numbers(numbers) for key, numbers in TEXT_LINE.findall(text)}
-    if any(re.fullmatch(r"P\d|P_rect_\d+|cam[01]", key) for key in lines):
-        return lines
+        return {"COLMAP": [(model, _numbers(numbers)) for model, numbers in cameras]}
+    found = {key: _numbers(numbers) for key, numbers in TEXT_LINE.findall(text)}
+    if any(re.fullmatch(r"P\d|P_rect_\d+|cam[01]", key) for key in found):
+        return found
+    if re.match(r"\[\w+\]\s*$|\w+[ \t]*=", lines, re.MULTILINE):
+        parser = configparser.ConfigParser(strict=False, interpolation=None)
+        parser.optionxform = str  # type: ignore[assignment,method-assign]
+        parser.read_string(lines if lines.startswith("[") else f"[camera]\n{lines}")
+        return {name: dict(parser[name]) for name in parser.sections()}
+    values = json.loads(text) if text[:1] in ("{", "[") else _yaml(text)
+    if isinstance(values, list):
+        values = dict(enumerate(values))
+    if not isinstance(values, dict):
+        raise ReconstructionError(f"it holds no cameras: {KNOWN}")
+    return values
+
+
+def _yaml(text: str) -> Any:
+    """Parse YAML, with OpenCV's tags. "Camera.fx: 500" becomes an object "Camera" with "fx"."""
     import yaml
 
     Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # a subclass, to accept OpenCV's tags
     Loader.add_multi_constructor("", lambda loader, _, node: loader.construct_mapping(node, True))
     # ROS ends its file with the start of a second YAML document, so only the first one is read.
     values = next(yaml.load_all(re.sub(r"\A%YAML[^\n]*\n", "", text), Loader), None)
-    if not isinstance(values, dict):
-        raise ReconstructionError(f"it holds no cameras: {KNOWN}")
+    for key in [*values] if isinstance(values, dict) else ():
+        head, dot, tail = str(key).partition(".")
+        if dot and isinstance(of_head := values.setdefault(head, {}), dict):
+            of_head[tail] = values[key]
     return values
+
+
+def _matrix_or_line(numbers: list[float], text: str) -> Values:
+    """Return the values of a file that has only numbers: a matrix, or fx fy cx cy k1 k2 ..."""
+    if len(numbers) == 16 and numbers[12:] == [0, 0, 0, 1]:
+        return {"matrix": numbers[:12]}
+    triangular = len(numbers) == 9 and 0 in (numbers[1], numbers[3])
+    if len(numbers) == 12 or triangular or (len(numbers) == 9 and "\n" in text):
+        return {"matrix": numbers}
+    if not 4 <= len(numbers) <= 9:
+        raise ReconstructionError(f"it holds {len(numbers)} numbers: {KNOWN}")
+    return dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=False)) | {"coefficients": numbers[4:]}
 
 
 def _numbers(text: str) -> list[float]:
@@ -119,42 +172,14 @@ def _xml_values(node: ElementTree.Element) -> Any:
     return _numbers(node.text or "") or node.text
 
 
-def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | None:
-    """Return the first value at `keys` whose size is in `sizes`, as three rows, or else None."""
-    for key in keys:
-        value = values.get(key)
-        data = value.get("data") if isinstance(value, Mapping) else value
-        if data is not None and np.size(data) in sizes:
-            return np.array(data, np.float64).reshape(3, -1)
-    return None
-
-
-NO_PINHOLES = "fisheye", "equidistant", "equirectangular"
-"""Camera models with one of these words in their name are rejected, even without distortion."""
-
-
-def _check_distortion(value: Any, model: Any) -> None:
-    if any(name in str(model).lower() for name in NO_PINHOLES):
-        raise ReconstructionError(f"its model is {model}: give a pinhole camera")
-    data = value.get("data") if isinstance(value, Mapping) else value
-    numbers = np.array(0 if data is None else data, np.float64).ravel()
-    if numbers.any():
-        raise ReconstructionError(
-            f"its cameras have distortion ({model} {', '.join(f'{n:g}' for n in numbers)}), which "
-            "is not supported: undistort the images, for example with cv2.undistort, and give the "
-            "camera matrix without coefficients"
-        )
-
-
-def _both(left: np.ndarray, right: np.ndarray, size: Any, baseline_mm: Any) -> dict[str, Any]:
-    """Return a dictionary with the keys of calib.json for two camera matrices."""
-    views = [
-        {"focal_px": [float(m[0, 0]), float(m[1, 1])], "cx": float(m[0, 2]), "cy": float(m[1, 2])}
-        for m in (left, right)
-    ]
-    values = {**views[0], "left": views[0], "right": views[1], "baseline_mm": baseline_mm}
-    names = ("width", "height") if size is not None else ()
-    return values | {n: int(np.ravel(value)[0]) for n, value in zip(names, size or (), strict=True)}
+def _both(
+    left: np.ndarray, right: np.ndarray, size: Any, baseline_mm: float | None
+) -> dict[str, Any]:
+    """Return a dictionary with the keys of calib.json for two camera or projection matrices."""
+    sides = [int(np.ravel(value)[0]) for value in size or ()]
+    found = pair(view_of_matrix(left, sides), view_of_matrix(right, sides), baseline_mm)
+    # The principal point of rectified images may lie outside of them.
+    return {**found, "rectified": left.shape[1] == 4}
 
 
 def _metres(left: np.ndarray, right: np.ndarray) -> float | None:
@@ -163,7 +188,7 @@ def _metres(left: np.ndarray, right: np.ndarray) -> float | None:
         return None
     distance = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
     if distance < 0:
-        raise ReconstructionError("its second camera is to the left of its first: swap the two")
+        raise ReconstructionError("has its second camera to the left of its first: swap the two")
     return distance or None
 
 
@@ -172,55 +197,39 @@ def _distance(first: Values, second: Values) -> float | None:
     if "T_BS" in first and "T_BS" in second:
         left, right = (np.reshape(each["T_BS"]["data"], (4, 4))[:3, 3] for each in (first, second))
         return float(np.linalg.norm(left - right)) * MM_PER_M
-    p0, p1 = (_matrix(each, PROJECTIONS, 12) for each in (first, second))
+    p0, p1 = (matrix_at(each, PROJECTIONS, 12) for each in (first, second))
     distance = None if p0 is None or p1 is None else _metres(p0, p1)
     return distance and distance * MM_PER_M
 
 
-def _calib_json(values: Values, views: tuple[int, int] | None) -> dict[str, Any]:
-    own = {"focal_px", "left", "right", "baseline_mm", "disparity_offset_px", "cx", "cy"}
-    if not values or own & {*values}:
-        return dict(values)
-    for read in (_colmap, _kitti, _middlebury, _kalibr, _opencv):
-        if (found := read(values, views)) is not None:
-            return found
-    keys = ", ".join(map(str, [*values][:5]))
-    raise ReconstructionError(f"it has no cameras in a known format, only the keys {keys}: {KNOWN}")
-
-
-def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
-    cameras = values.get("cameras")
-    if not cameras:
-        return None
-    if len(cameras) > 2:
-        raise ReconstructionError(f"it has {len(cameras)} cameras: keep the left and the right one")
+def _colmap(values: Values, image: Size, _: Any) -> dict[str, Any]:
     made = []
-    for model, (width, height, *numbers) in cameras:
-        _check_distortion(0, model)
+    for model, (width, height, *numbers) in values["COLMAP"]:
+        check_model(model)
         if model.startswith(("SIMPLE_", "RADIAL")):  # these models have a single focal length
             numbers.insert(0, numbers[0])
         fx, fy, cx, cy, *distortion = numbers
-        _check_distortion(distortion, model)
-        matrix = np.array([[fx, 0, cx - COLMAP_CENTRE], [0, fy, cy - COLMAP_CENTRE], [0, 0, 1]])
-        size = {"width": int(width), "height": int(height)}
-        made.append({**_both(matrix, matrix, None, None)["left"], **size})
-    return {**made[0], "left": made[0], "right": made[-1]}
+        check_distortion(distortion, model)
+        made.append(view_of((fx, fy), (cx, cy), (width, height), HALF_PIXEL))
+    return pair(made[0], made[-1]) if len(made) <= 2 else only(made, image)
 
 
-def _kitti(values: Values, views: tuple[int, int] | None) -> dict[str, Any] | None:
+def _kitti(
+    values: Values, _: Any, views: tuple[int, int] | None
+) -> dict[str, Any] | None:
     """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw), by default 2 and 3."""
     for start in ("P", "P_rect_0"):
-        for pair in (views or (2, 3), (2, 3), (0, 1)):
-            left, right = (_matrix(values, [f"{start}{view}"], 12) for view in pair)
+        for numbers in (views or (2, 3), (2, 3), (0, 1)):
+            left, right = (matrix_at(values, [f"{start}{view}"], 12) for view in numbers)
             if left is not None and right is not None:
                 distance = _metres(left, right)
-                size = values.get(f"S_rect_0{pair[0]}")
+                size = values.get(f"S_rect_0{numbers[0]}")
                 return _both(left, right, size, distance and distance * MM_PER_M)
     return None
 
 
-def _middlebury(values: Values, _: Any) -> dict[str, Any] | None:
-    left, right = (_matrix(values, [key], 9) for key in ("cam0", "cam1"))
+def _middlebury(values: Values, image: Size, _: Any) -> dict[str, Any] | None:
+    left, right = (matrix_at(values, [key], 9) for key in ("cam0", "cam1"))
     if left is None or right is None:
         return None
     if offset := values.get("doffs"):
@@ -228,7 +237,7 @@ def _middlebury(values: Values, _: Any) -> dict[str, Any] | None:
     return _both(left, right, _size(values), values.get("baseline", [None])[0])
 
 
-def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
+def _kalibr(values: Values, image: Size, _: Any) -> dict[str, Any] | None:
     """Read a camera chain of Kalibr, or a file with one camera, such as EuRoC's sensor.yaml."""
     cameras = [each for key in ("cam0", "cam1") if isinstance(each := values.get(key), Mapping)]
     matrices = []
@@ -237,10 +246,11 @@ def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
             return None
         if camera["camera_model"] != "pinhole":
             raise ReconstructionError(
-                f"its model is {camera['camera_model']}: give a pinhole camera"
+                f"has the camera model {camera['camera_model']}: give a pinhole camera"
             )
+        check_model(camera.get("distortion_model"))
         value = next((camera[key] for key in DISTORTIONS if key in camera), None)
-        _check_distortion(value, camera.get("distortion_model"))
+        check_distortion(value, camera.get("distortion_model"))
         fx, fy, cx, cy = map(float, camera["intrinsics"])
         matrices.append(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     move = np.array(cameras[-1].get("T_cn_cnm1", np.eye(4)) if cameras else np.eye(4), np.float64)
@@ -248,25 +258,26 @@ def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
     return _both(matrices[0], matrices[-1], _size((cameras or [values])[0]), distance or None)
 
 
-def _opencv(values: Values, _: Any) -> dict[str, Any] | None:
+def _opencv(values: Values, image: Size, _: Any) -> dict[str, Any] | None:
     """Read a file of OpenCV or ROS. If it has distortion, it also needs rectified projections."""
     for first, second, distortion in STEREO:
-        left, right = (_matrix(values, [key], 9, 12) for key in (first, second))
+        left, right = (matrix_at(values, [key], 9, 12) for key in (first, second))
         if left is not None and right is not None:
             for number in "12" if distortion else "":
-                _check_distortion(values.get(distortion + number), "coefficients")
-            move = _matrix(values, ["T"], 3)
+                check_distortion(values.get(distortion + number), distortion + number)
+            move = matrix_at(values, ["T"], 3)
             length = _metres(left, right)
             length = float(np.linalg.norm(move)) if length is None and move is not None else length
             unit = MM_PER_M if length and length < MIN_BASELINE_MM else 1.0
             return _both(left, right, _size(values), length and length * unit)
-    matrix, projection = _matrix(values, MATRICES, 9, 12), _matrix(values, PROJECTIONS, 12)
+    matrix, projection = matrix_at(values, MATRICES, 9, 12), matrix_at(values, PROJECTIONS, 12)
     if projection is not None and projection[0, 0] > 0:
         return _both(projection, projection, _size(values), None)
     if matrix is None:
         return None
     value = next((values[key] for key in DISTORTIONS if key in values), None)
-    _check_distortion(value, values.get("distortion_model", "coefficients"))
+    check_model(values.get("distortion_model"))
+    check_distortion(value, values.get("distortion_model", "coefficients"))
     return _both(matrix, matrix, _size(values), None)
 
 
@@ -275,3 +286,77 @@ def _size(values: Values) -> Any:
         if width in values and height in values:
             return values[width], values[height]
     return values.get("resolution")
+
+
+Reader = Callable[[Values, Size, tuple[int, int] | None], dict[str, Any] | None]
+
+
+class Format(NamedTuple):
+    """A format: whose file it is, a pattern that one of its keys has, and its reader."""
+
+    name: str
+    key: str
+    read: Reader
+
+
+FORMATS = (
+    Format("COLMAP's list of cameras", "COLMAP", _colmap),
+    Format("KITTI's calibration", r"P\d|P_rect_0\d", _kitti),
+    Format("Middlebury's calibration", "cam0", _middlebury),
+    Format("EuRoC's sensor.yaml", "T_BS", _kalibr),
+    Format("Kalibr's calibration", "cam0|camera_model", _kalibr),
+    Format("the calibration of stella_vslam", "Camera", formats.stella),
+    Format("ORB-SLAM's calibration", "Camera1?", formats.orb_slam),
+    Format("ZED's calibration", r"LEFT_CAM_\w+", formats.zed),
+    Format("RealSense's calibration", "ppx", formats.plain),
+    Format("DepthAI's calibration", "cameraData", formats.depthai),
+    Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", formats.open3d),
+    Format("OpenMVG's calibration", "sfm_data_version", formats.openmvg),
+    Format("Meshroom's calibration", "intrinsics", formats.meshroom),
+    Format("Metashape's calibration", "metashape", formats.metashape),
+    Format("Bundler's file", "bundler", formats.bundler),
+    Format("MATLAB's calibration", "IntrinsicMatrix|RadialDistortion|CameraPar.*", formats.matlab),
+    Format("transforms.json", "fl_x|camera_angle_x|frames", formats.nerfstudio),
+    Format("OpenSfM's list of cameras", ".*", formats.opensfm),
+    Format("the file", "matrix", _opencv),
+    Format("ROS's calibration", "distortion_model|camera_name|projection_matrix|roi", _opencv),
+    Format("OpenCV's calibration", ".*", _opencv),
+    Format("the file", ".*", formats.plain),
+)
+"""The formats, in the order in which they are tried."""
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Say whose file it is in errors of the readers, and which value is missing there."""
+    try:
+        yield
+    except ReconstructionError as error:
+        raise ReconstructionError(f"{name} {error}") from None
+    except KeyError as error:
+        raise ReconstructionError(f"{name} has no {error.args[0]}: export it again") from None
+
+
+def _calib_json(
+    values: Values, image: Size, views: tuple[int, int] | None
+) -> dict[str, Any]:
+    sides = [each for key in ("left", "right") if isinstance(each := values.get(key), Mapping)]
+    if not values or any({"focal_px", "baseline_mm"} & {*each} for each in (values, *sides)):
+        for key, value in values.items():
+            if key not in OWN_KEYS and not isinstance(value, Mapping) and any(numbers_in(value)):
+                known = ", ".join(OWN_KEYS)
+                raise ReconstructionError(
+                    f'its key "{key}" is not known: leave it out, or write one of {known}; images '
+                    "with distortion must be undistorted first"
+                )
+        return dict(values)
+    for name, key, read in FORMATS:
+        if not any(re.fullmatch(key, str(each)) for each in values):
+            continue
+        with _named(name):
+            if (found := read(values, image, views)) is not None:
+                for side in ("left", "right"):
+                    check_view(found[side], None if found.get("rectified") else image)
+                return {**found, "format": name}
+    keys = ", ".join(map(str, [*values][:5]))
+    raise ReconstructionError(f"it has no cameras in a known format, only the keys {keys}: {KNOWN}")
