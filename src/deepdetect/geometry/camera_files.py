@@ -9,7 +9,7 @@ from __future__ import annotations
 import configparser
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,22 +19,7 @@ import numpy as np
 
 from .._shared.errors import ReconstructionError
 from . import camera_formats as formats
-from .camera_formats import (
-    HALF_PIXEL,
-    MATRICES,
-    MM_PER_M,
-    Size,
-    Values,
-    check_distortion,
-    check_model,
-    check_view,
-    matrix_at,
-    numbers_in,
-    only,
-    pair,
-    view_of,
-    view_of_matrix,
-)
+from .camera_formats import MATRICES, MM_PER_M, Found, Size, Values, matrix_at, numbers_in
 
 STEREO = (
     *(("P1", "P2", ""), ("M1", "M2", "D"), ("K1", "K2", "D")),
@@ -44,11 +29,6 @@ STEREO = (
 the distortion coefficients without the final 1 or 2. The first row is for rectified views."""
 
 PROJECTIONS = ("projection_matrix", "P", "p")
-DISTORTIONS = (
-    *("distortion_coefficients", "Distortion_Coefficients", "distortion_coeffs", "distCoeffs"),
-    *("dist_coeffs", "D", "d", "D1", "distCoeffs1"),
-)
-
 FILES_OF_PAIRS = (
     *(("left.yaml", "right.yaml"), ("intrinsics.yml", "extrinsics.yml")),
     *(("cam0/sensor.yaml", "cam1/sensor.yaml"), ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml")),
@@ -62,6 +42,8 @@ number is smaller than this, else in mm. Chosen by hand."""
 NUMBERS = r"([-+.\deE \t;,\[\]]+)\r?$"
 COLMAP_LINE = re.compile(rf"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]{NUMBERS}", re.MULTILINE)
 TEXT_LINE = re.compile(rf"^[ \t]*(\w+)[ \t]*[:=]{NUMBERS}", re.MULTILINE)
+
+SIZES = "image_width", "image_height", "width", "height", "resolution"
 
 OWN_KEYS = (
     *("focal_px", "cx", "cy", "width", "height", "baseline_mm", "disparity_offset_px"),
@@ -149,13 +131,13 @@ def _yaml(text: str) -> Any:
 def _matrix_or_line(numbers: list[float], text: str) -> Values:
     """Return the values of a file that has only numbers: a matrix, or fx fy cx cy k1 k2 ..."""
     if len(numbers) == 16 and numbers[12:] == [0, 0, 0, 1]:
-        return {"matrix": numbers[:12]}
-    triangular = len(numbers) == 9 and 0 in (numbers[1], numbers[3])
-    if len(numbers) == 12 or triangular or (len(numbers) == 9 and "\n" in text):
-        return {"matrix": numbers}
+        return {"camera_matrix": numbers[:12]}
+    one_line = "\n" not in text and 0 not in (numbers[1:4:2] if len(numbers) == 9 else ())
+    if len(numbers) == 12 or (len(numbers) == 9 and not one_line):
+        return {"camera_matrix": numbers}
     if not 4 <= len(numbers) <= 9:
         raise ReconstructionError(f"it holds {len(numbers)} numbers: {KNOWN}")
-    return dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=False)) | {"coefficients": numbers[4:]}
+    return formats.of_line(numbers)
 
 
 def _numbers(text: str) -> list[float]:
@@ -170,16 +152,6 @@ def _xml_values(node: ElementTree.Element) -> Any:
     if len(node):
         return {child.tag: _xml_values(child) for child in node}
     return _numbers(node.text or "") or node.text
-
-
-def _both(
-    left: np.ndarray, right: np.ndarray, size: Any, baseline_mm: float | None
-) -> dict[str, Any]:
-    """Return a dictionary with the keys of calib.json for two camera or projection matrices."""
-    sides = [int(np.ravel(value)[0]) for value in size or ()]
-    found = pair(view_of_matrix(left, sides), view_of_matrix(right, sides), baseline_mm)
-    # The principal point of rectified images may lie outside of them.
-    return {**found, "rectified": left.shape[1] == 4}
 
 
 def _metres(left: np.ndarray, right: np.ndarray) -> float | None:
@@ -202,124 +174,102 @@ def _distance(first: Values, second: Values) -> float | None:
     return distance and distance * MM_PER_M
 
 
-def _colmap(values: Values, image: Size, _: Any) -> dict[str, Any]:
-    made = []
+def _matrices(values: Values, matrices: Iterable[np.ndarray], baseline_mm: float | None) -> Found:
+    """Return cameras of the size that the values state, without their distortion."""
+    size = {key: values[key] for key in SIZES if key in values}
+    return Found([{**size, "K": matrix} for matrix in matrices], True, baseline_mm)
+
+
+def _colmap(values: Values, image: Size) -> Found:
+    cameras = []
     for model, (width, height, *numbers) in values["COLMAP"]:
-        check_model(model)
         if model.startswith(("SIMPLE_", "RADIAL")):  # these models have a single focal length
             numbers.insert(0, numbers[0])
-        fx, fy, cx, cy, *distortion = numbers
-        check_distortion(distortion, model)
-        made.append(view_of((fx, fy), (cx, cy), (width, height), HALF_PIXEL))
-    return pair(made[0], made[-1]) if len(made) <= 2 else only(made, image)
+        size = {"model": model, "width": width, "height": height}
+        cameras.append({**size, **formats.of_line(numbers)})
+    return Found(cameras, len(cameras) == 2)
 
 
-def _kitti(
-    values: Values, _: Any, views: tuple[int, int] | None
-) -> dict[str, Any] | None:
+def _kitti(values: Values, image: Size, views: tuple[int, int] | None = None) -> Found | None:
     """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw), by default 2 and 3."""
     for start in ("P", "P_rect_0"):
-        for numbers in (views or (2, 3), (2, 3), (0, 1)):
-            left, right = (matrix_at(values, [f"{start}{view}"], 12) for view in numbers)
+        for first, second in (views or (2, 3), (2, 3), (0, 1)):
+            left, right = (matrix_at(values, [f"{start}{n}"], 12) for n in (first, second))
             if left is not None and right is not None:
                 distance = _metres(left, right)
-                size = values.get(f"S_rect_0{numbers[0]}")
-                return _both(left, right, size, distance and distance * MM_PER_M)
+                size = {"resolution": values.get(f"S_rect_0{first}")}
+                return _matrices(size, (left, right), distance and distance * MM_PER_M)
     return None
 
 
-def _middlebury(values: Values, image: Size, _: Any) -> dict[str, Any] | None:
+def _middlebury(values: Values, image: Size) -> Found | None:
     left, right = (matrix_at(values, [key], 9) for key in ("cam0", "cam1"))
     if left is None or right is None:
         return None
     if offset := values.get("doffs"):
         right[0, 2] = left[0, 2] + offset[0]
-    return _both(left, right, _size(values), values.get("baseline", [None])[0])
+    return _matrices(values, (left, right), values.get("baseline", [None])[0])
 
 
-def _kalibr(values: Values, image: Size, _: Any) -> dict[str, Any] | None:
+def _kalibr(values: Values, image: Size) -> Found | None:
     """Read a camera chain of Kalibr, or a file with one camera, such as EuRoC's sensor.yaml."""
-    cameras = [each for key in ("cam0", "cam1") if isinstance(each := values.get(key), Mapping)]
-    matrices = []
-    for camera in cameras or [values]:
-        if not {"camera_model", "intrinsics"} <= {*camera}:
-            return None
-        if camera["camera_model"] != "pinhole":
-            raise ReconstructionError(
-                f"has the camera model {camera['camera_model']}: give a pinhole camera"
-            )
-        check_model(camera.get("distortion_model"))
-        value = next((camera[key] for key in DISTORTIONS if key in camera), None)
-        check_distortion(value, camera.get("distortion_model"))
-        fx, fy, cx, cy = map(float, camera["intrinsics"])
-        matrices.append(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    move = np.array(cameras[-1].get("T_cn_cnm1", np.eye(4)) if cameras else np.eye(4), np.float64)
-    distance = float(np.linalg.norm(move[:3, 3])) * MM_PER_M
-    return _both(matrices[0], matrices[-1], _size((cameras or [values])[0]), distance or None)
+    found = [each for key in ("cam0", "cam1") if isinstance(each := values.get(key), Mapping)]
+    cameras = found or [values]
+    if not all({"camera_model", "intrinsics"} <= {*camera} for camera in cameras):
+        return None
+    move = np.array(cameras[-1].get("T_cn_cnm1", np.eye(4)), np.float64)
+    return Found(cameras, True, float(np.linalg.norm(move[:3, 3])) * MM_PER_M)
 
 
-def _opencv(values: Values, image: Size, _: Any) -> dict[str, Any] | None:
+def _opencv(values: Values, image: Size) -> Found | None:
     """Read a file of OpenCV or ROS. If it has distortion, it also needs rectified projections."""
     for first, second, distortion in STEREO:
         left, right = (matrix_at(values, [key], 9, 12) for key in (first, second))
         if left is not None and right is not None:
             for number in "12" if distortion else "":
-                check_distortion(values.get(distortion + number), distortion + number)
+                formats.check_pinhole({"d": values.get(distortion + number)})
             move = matrix_at(values, ["T"], 3)
             length = _metres(left, right)
             length = float(np.linalg.norm(move)) if length is None and move is not None else length
             unit = MM_PER_M if length and length < MIN_BASELINE_MM else 1.0
-            return _both(left, right, _size(values), length and length * unit)
+            return _matrices(values, (left, right), length and length * unit)
     matrix, projection = matrix_at(values, MATRICES, 9, 12), matrix_at(values, PROJECTIONS, 12)
     if projection is not None and projection[0, 0] > 0:
-        return _both(projection, projection, _size(values), None)
-    if matrix is None:
-        return None
-    value = next((values[key] for key in DISTORTIONS if key in values), None)
-    check_model(values.get("distortion_model"))
-    check_distortion(value, values.get("distortion_model", "coefficients"))
-    return _both(matrix, matrix, _size(values), None)
-
-
-def _size(values: Values) -> Any:
-    for width, height in (("image_width", "image_height"), ("width", "height")):
-        if width in values and height in values:
-            return values[width], values[height]
-    return values.get("resolution")
-
-
-Reader = Callable[[Values, Size, tuple[int, int] | None], dict[str, Any] | None]
+        return _matrices(values, (projection,), None)
+    return None if matrix is None else Found([values])
 
 
 class Format(NamedTuple):
-    """A format: whose file it is, a pattern that one of its keys has, and its reader."""
+    """A format: whose file it is, a pattern that one of its keys has, and its reader.
+
+    `first` is the x and y of the centre of the first pixel. In this package they are 0.
+    """
 
     name: str
     key: str
-    read: Reader
+    read: Callable[[Values, Size], Found | None]
+    first: float | None = None
 
 
 FORMATS = (
-    Format("COLMAP's list of cameras", "COLMAP", _colmap),
+    Format("COLMAP's list of cameras", "COLMAP", _colmap, 0.5),
     Format("KITTI's calibration", r"P\d|P_rect_0\d", _kitti),
     Format("Middlebury's calibration", "cam0", _middlebury),
     Format("EuRoC's sensor.yaml", "T_BS", _kalibr),
     Format("Kalibr's calibration", "cam0|camera_model", _kalibr),
-    Format("the calibration of stella_vslam", "Camera", formats.stella),
-    Format("ORB-SLAM's calibration", "Camera1?", formats.orb_slam),
+    Format("ORB-SLAM's or stella_vslam's calibration", "Camera1?", formats.orb_slam),
     Format("ZED's calibration", r"LEFT_CAM_\w+", formats.zed),
     Format("RealSense's calibration", "ppx", formats.plain),
     Format("DepthAI's calibration", "cameraData", formats.depthai),
-    Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", formats.open3d),
-    Format("OpenMVG's calibration", "sfm_data_version", formats.openmvg),
-    Format("Meshroom's calibration", "intrinsics", formats.meshroom),
-    Format("Metashape's calibration", "metashape", formats.metashape),
+    Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", formats.plain, 0.0),
+    Format("OpenMVG's calibration", "sfm_data_version", formats.plain, 0.0),
+    Format("Meshroom's calibration", "intrinsics", formats.meshroom, 0.0),
+    Format("Metashape's calibration", "metashape", formats.metashape, 0.5),
     Format("Bundler's file", "bundler", formats.bundler),
-    Format("MATLAB's calibration", "IntrinsicMatrix|RadialDistortion|CameraPar.*", formats.matlab),
-    Format("transforms.json", "fl_x|camera_angle_x|frames", formats.nerfstudio),
+    Format("MATLAB's calibration", "IntrinsicMatrix|RadialDistortion", formats.plain, 1.0),
+    Format("transforms.json", "fl_x|camera_angle_x|frames", formats.nerfstudio, 0.5),
     Format("OpenSfM's list of cameras", ".*", formats.opensfm),
-    Format("the file", "matrix", _opencv),
-    Format("ROS's calibration", "distortion_model|camera_name|projection_matrix|roi", _opencv),
+    Format("ROS's calibration", "distortion_model|camera_name|projection_matrix", _opencv),
     Format("OpenCV's calibration", ".*", _opencv),
     Format("the file", ".*", formats.plain),
 )
@@ -337,26 +287,37 @@ def _named(name: str) -> Iterator[None]:
         raise ReconstructionError(f"{name} has no {error.args[0]}: export it again") from None
 
 
-def _calib_json(
-    values: Values, image: Size, views: tuple[int, int] | None
-) -> dict[str, Any]:
+def _calib_json(values: Values, image: Size, views: tuple[int, int] | None) -> dict[str, Any]:
     sides = [each for key in ("left", "right") if isinstance(each := values.get(key), Mapping)]
     if not values or any({"focal_px", "baseline_mm"} & {*each} for each in (values, *sides)):
         for key, value in values.items():
             if key not in OWN_KEYS and not isinstance(value, Mapping) and any(numbers_in(value)):
-                known = ", ".join(OWN_KEYS)
                 raise ReconstructionError(
-                    f'its key "{key}" is not known: leave it out, or write one of {known}; images '
-                    "with distortion must be undistorted first"
+                    f'its key "{key}" is not known: leave it out if it is no distortion, or write '
+                    f"one of {', '.join(OWN_KEYS)}"
                 )
         return dict(values)
-    for name, key, read in FORMATS:
-        if not any(re.fullmatch(key, str(each)) for each in values):
-            continue
-        with _named(name):
-            if (found := read(values, image, views)) is not None:
-                for side in ("left", "right"):
-                    check_view(found[side], None if found.get("rectified") else image)
-                return {**found, "format": name}
+    for name, key, read, first in FORMATS:
+        if any(re.fullmatch(key, str(each)) for each in values):
+            with _named(name):
+                found = _kitti(values, image, views) if read is _kitti else read(values, image)
+                if found is not None:
+                    return {**_cameras(found, image, first), "format": name}
     keys = ", ".join(map(str, [*values][:5]))
     raise ReconstructionError(f"it has no cameras in a known format, only the keys {keys}: {KNOWN}")
+
+
+def _cameras(found: Found, image: Size, first: float | None) -> dict[str, Any]:
+    """Return a dictionary with the keys of calib.json for the cameras of a file."""
+    views = [view for each in found.cameras if (view := formats.view_of(each, image, first))]
+    if not found.stereo:
+        views = list({repr(view): view for view in views}.values())  # equal ones count as one
+        fitting = [v for v in views if (v.get("width"), v.get("height")) == image]
+        views = fitting if fitting and len(views) > 1 else views
+    if not views or len(views) > 1 + found.stereo:
+        number = (
+            f"{len(views)} different cameras: keep the one" if views else "no cameras: give one"
+        )
+        raise ReconstructionError(f"has {number} of these images")
+    baseline_mm = found.baseline_mm or None
+    return {**views[0], "left": views[0], "right": views[-1], "baseline_mm": baseline_mm}
