@@ -199,25 +199,18 @@ class Calibration:
     def save(self, path: str | Path) -> None:
         """Write the package's own camera file, from which `load` reads the same cameras.
 
-        Args:
-            path: the file, such as calib.json. A file of this name is replaced.
-
-        Raises:
-            OSError: the file cannot be written.
-
         Example:
             >>> import tempfile
             >>> path = Path(tempfile.mkdtemp()) / "calib.json"
-            >>> camera = Camera((640, 480), 500.0)
-            >>> Calibration(camera, camera, baseline_mm=120).save(path)
+            >>> Calibration(Camera((640, 480), 500), Camera((640, 480), 500), 120).save(path)
             >>> Calibration.load(path).baseline_mm
             120.0
         """
         values: dict[str, Any] = {"baseline_mm": self.baseline_mm}
         for side, camera in (("left", self.camera0), ("right", self.camera1)):
-            names = ("focal_px", "cx", "cy", "width", "height")
-            numbers = (camera.focal_px, *camera.centre, *camera.size)
-            values[side] = dict(zip(names, numbers, strict=True))
+            (cx, cy), (width, height) = camera.centre, camera.size
+            values[side] = {"focal_px": camera.focal_px, "cx": cx, "cy": cy}
+            values[side] |= {"width": width, "height": height}
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
 

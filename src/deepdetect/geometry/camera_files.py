@@ -9,17 +9,16 @@ from __future__ import annotations
 import configparser
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from .._shared.errors import ReconstructionError
 from . import camera_formats as formats
-from .camera_formats import MATRICES, MM_PER_M, Found, Size, Values, matrix_at, numbers_in
+from .camera_formats import MM_PER_M, Format, Found, Pair, Values, matrix_at, numbers_in
 
 STEREO = (
     *(("P1", "P2", ""), ("M1", "M2", "D"), ("K1", "K2", "D")),
@@ -56,14 +55,12 @@ KNOWN = (
 )
 
 
-def read_camera_file(
-    path: Path, image: Size = None, views: tuple[int, int] | None = None
-) -> dict[str, Any]:
+def read_camera_file(path: Path, image: Pair = None, views: Pair = None) -> dict[str, Any]:
     """Read a camera file, or a folder with two; return a dictionary with the keys of calib.json.
 
-    `image` is the (width, height) of the first image, if it is known. `views` are the numbers of
-    the left and the right camera in a KITTI file, which has several. The key "format" of the result
-    says whose file it is, as the subject of a sentence.
+    `image` is the (width, height) of the first image, if it is known, and `views` the numbers of
+    left and right camera in KITTI's files, which have several. The key "format" of the result says
+    whose file it is.
 
     Raises:
         ReconstructionError: the format is unknown, or the cameras have distortion.
@@ -77,8 +74,7 @@ def read_camera_file(
             if names[1] == "extrinsics.yml":
                 return _calib_json({**first, **second}, image, views)
             left, right = (_calib_json(each, image, None) for each in (first, second))
-            with _named(left["format"]):
-                return {**left, "right": right["right"], "baseline_mm": _distance(first, second)}
+            return {**left, "right": right["right"], "baseline_mm": _distance(first, second)}
     wanted = ", or ".join(" and ".join(names) for names in FILES_OF_PAIRS)
     raise ReconstructionError(f"the folder does not contain {wanted}: give a file")
 
@@ -94,7 +90,13 @@ def _parsed(content: bytes) -> Values:
         return {"bundler": _numbers(text.partition("\n")[2])}
     lines = re.sub(r"^[ \t]*(#|//).*$", "", text, flags=re.MULTILINE).strip()
     if numbers := _numbers(lines):
-        return _matrix_or_line(numbers, lines)
+        numbers = numbers[:12] if numbers[12:] == [0, 0, 0, 1] else numbers
+        broken = "\n" in lines or 0 in numbers[1:4:2]
+        if len(numbers) not in (*range(4, 10), 12) or (len(numbers) == 4 and broken):
+            raise ReconstructionError(f"it holds {len(numbers)} numbers: {KNOWN}")
+        if len(numbers) == 12 or (len(numbers) == 9 and broken):
+            return {"matrix": numbers}
+        return {"intrinsics": numbers[:4], "coefficients": numbers[4:]}
     if cameras := COLMAP_LINE.findall(text):
         return {"COLMAP": [(model, _numbers(numbers)) for model, numbers in cameras]}
     found = {key: _numbers(numbers) for key, numbers in TEXT_LINE.findall(text)}
@@ -128,18 +130,6 @@ def _yaml(text: str) -> Any:
     return values
 
 
-def _matrix_or_line(numbers: list[float], text: str) -> Values:
-    """Return the values of a file that has only numbers: a matrix, or fx fy cx cy k1 k2 ..."""
-    if len(numbers) == 16 and numbers[12:] == [0, 0, 0, 1]:
-        return {"camera_matrix": numbers[:12]}
-    one_line = "\n" not in text and 0 not in (numbers[1:4:2] if len(numbers) == 9 else ())
-    if len(numbers) == 12 or (len(numbers) == 9 and not one_line):
-        return {"camera_matrix": numbers}
-    if not 4 <= len(numbers) <= 9:
-        raise ReconstructionError(f"it holds {len(numbers)} numbers: {KNOWN}")
-    return formats.of_line(numbers)
-
-
 def _numbers(text: str) -> list[float]:
     words = re.split(r"[\s,;\[\]]+", text.strip(" \t\r\n[]"))
     try:
@@ -160,7 +150,7 @@ def _metres(left: np.ndarray, right: np.ndarray) -> float | None:
         return None
     distance = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
     if distance < 0:
-        raise ReconstructionError("has its second camera to the left of its first: swap the two")
+        raise ReconstructionError("it has its second camera to the left of its first: swap the two")
     return distance or None
 
 
@@ -180,20 +170,20 @@ def _matrices(values: Values, matrices: Iterable[np.ndarray], baseline_mm: float
     return Found([{**size, "K": matrix} for matrix in matrices], True, baseline_mm)
 
 
-def _colmap(values: Values, image: Size) -> Found:
+def _colmap(values: Values, image: Pair) -> Found:
     cameras = []
     for model, (width, height, *numbers) in values["COLMAP"]:
         if model.startswith(("SIMPLE_", "RADIAL")):  # these models have a single focal length
             numbers.insert(0, numbers[0])
         size = {"model": model, "width": width, "height": height}
-        cameras.append({**size, **formats.of_line(numbers)})
+        cameras.append({**size, "intrinsics": numbers[:4], "coefficients": numbers[4:]})
     return Found(cameras, len(cameras) == 2)
 
 
-def _kitti(values: Values, image: Size, views: tuple[int, int] | None = None) -> Found | None:
+def _kitti(values: Values, image: Pair) -> Found | None:
     """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw), by default 2 and 3."""
     for start in ("P", "P_rect_0"):
-        for first, second in (views or (2, 3), (2, 3), (0, 1)):
+        for first, second in (values["views"] or (2, 3), (2, 3), (0, 1)):
             left, right = (matrix_at(values, [f"{start}{n}"], 12) for n in (first, second))
             if left is not None and right is not None:
                 distance = _metres(left, right)
@@ -202,7 +192,7 @@ def _kitti(values: Values, image: Size, views: tuple[int, int] | None = None) ->
     return None
 
 
-def _middlebury(values: Values, image: Size) -> Found | None:
+def _middlebury(values: Values, image: Pair) -> Found | None:
     left, right = (matrix_at(values, [key], 9) for key in ("cam0", "cam1"))
     if left is None or right is None:
         return None
@@ -211,7 +201,7 @@ def _middlebury(values: Values, image: Size) -> Found | None:
     return _matrices(values, (left, right), values.get("baseline", [None])[0])
 
 
-def _kalibr(values: Values, image: Size) -> Found | None:
+def _kalibr(values: Values, image: Pair) -> Found | None:
     """Read a camera chain of Kalibr, or a file with one camera, such as EuRoC's sensor.yaml."""
     found = [each for key in ("cam0", "cam1") if isinstance(each := values.get(key), Mapping)]
     cameras = found or [values]
@@ -221,7 +211,7 @@ def _kalibr(values: Values, image: Size) -> Found | None:
     return Found(cameras, True, float(np.linalg.norm(move[:3, 3])) * MM_PER_M)
 
 
-def _opencv(values: Values, image: Size) -> Found | None:
+def _opencv(values: Values, image: Pair) -> Found | None:
     """Read a file of OpenCV or ROS. If it has distortion, it also needs rectified projections."""
     for first, second, distortion in STEREO:
         left, right = (matrix_at(values, [key], 9, 12) for key in (first, second))
@@ -233,22 +223,13 @@ def _opencv(values: Values, image: Size) -> Found | None:
             length = float(np.linalg.norm(move)) if length is None and move is not None else length
             unit = MM_PER_M if length and length < MIN_BASELINE_MM else 1.0
             return _matrices(values, (left, right), length and length * unit)
-    matrix, projection = matrix_at(values, MATRICES, 9, 12), matrix_at(values, PROJECTIONS, 12)
+    matrix, projection = (
+        matrix_at(values, formats.MATRICES, 9, 12),
+        matrix_at(values, PROJECTIONS, 12),
+    )
     if projection is not None and projection[0, 0] > 0:
         return _matrices(values, (projection,), None)
     return None if matrix is None else Found([values])
-
-
-class Format(NamedTuple):
-    """A format: whose file it is, a pattern that one of its keys has, and its reader.
-
-    `first` is the x and y of the centre of the first pixel. In this package they are 0.
-    """
-
-    name: str
-    key: str
-    read: Callable[[Values, Size], Found | None]
-    first: float | None = None
 
 
 FORMATS = (
@@ -264,60 +245,54 @@ FORMATS = (
     Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", formats.plain, 0.0),
     Format("OpenMVG's calibration", "sfm_data_version", formats.plain, 0.0),
     Format("Meshroom's calibration", "intrinsics", formats.meshroom, 0.0),
-    Format("Metashape's calibration", "metashape", formats.metashape, 0.5),
-    Format("Bundler's file", "bundler", formats.bundler),
+    Format("Metashape's calibration", "metashape", formats.metashape, 0.0, "middle"),
+    Format("Bundler's file", "bundler", formats.bundler, 0.0, "middle"),
     Format("MATLAB's calibration", "IntrinsicMatrix|RadialDistortion", formats.plain, 1.0),
     Format("transforms.json", "fl_x|camera_angle_x|frames", formats.nerfstudio, 0.5),
-    Format("OpenSfM's list of cameras", ".*", formats.opensfm),
+    Format("OpenSfM's list of cameras", ".*", formats.opensfm, 0.0, "fractions"),
+    Format("the file", "matrix", _opencv),
     Format("ROS's calibration", "distortion_model|camera_name|projection_matrix", _opencv),
     Format("OpenCV's calibration", ".*", _opencv),
-    Format("the file", ".*", formats.plain),
+    formats.ANY,
 )
 """The formats, in the order in which they are tried."""
 
 
-@contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Say whose file it is in errors of the readers, and which value is missing there."""
-    try:
-        yield
-    except ReconstructionError as error:
-        raise ReconstructionError(f"{name} {error}") from None
-    except KeyError as error:
-        raise ReconstructionError(f"{name} has no {error.args[0]}: export it again") from None
-
-
-def _calib_json(values: Values, image: Size, views: tuple[int, int] | None) -> dict[str, Any]:
+def _calib_json(values: Values, image: Pair, views: Pair) -> dict[str, Any]:
     sides = [each for key in ("left", "right") if isinstance(each := values.get(key), Mapping)]
     if not values or any({"focal_px", "baseline_mm"} & {*each} for each in (values, *sides)):
-        for key, value in values.items():
+        for key, value in [item for each in (values, *sides) for item in each.items()]:
             if key not in OWN_KEYS and not isinstance(value, Mapping) and any(numbers_in(value)):
-                raise ReconstructionError(
-                    f'its key "{key}" is not known: leave it out if it is no distortion, or write '
-                    f"one of {', '.join(OWN_KEYS)}"
-                )
+                known = ", ".join(OWN_KEYS)
+                raise ReconstructionError(f'it has the key "{key}": leave it out, or use {known}')
         return dict(values)
-    for name, key, read, first in FORMATS:
-        if any(re.fullmatch(key, str(each)) for each in values):
-            with _named(name):
-                found = _kitti(values, image, views) if read is _kitti else read(values, image)
+    names = []
+    for form in FORMATS:
+        if any(re.fullmatch(form.key, str(each)) for each in values):
+            names.append(form.name)
+            try:
+                found = form.read(
+                    {**values, "views": views} if form.read is _kitti else values, image
+                )
                 if found is not None:
-                    return {**_cameras(found, image, first), "format": name}
+                    return {**_cameras(found, image, form), "format": form.name}
+            except ReconstructionError as error:
+                raise ReconstructionError(form.name + str(error).removeprefix("it")) from None
+            except KeyError as error:
+                raise ReconstructionError(f"{form.name} has no {error.args[0]}: add it") from None
     keys = ", ".join(map(str, [*values][:5]))
-    raise ReconstructionError(f"it has no cameras in a known format, only the keys {keys}: {KNOWN}")
+    raise ReconstructionError(f"{names[0]} has no cameras, only the keys {keys}: {KNOWN}")
 
 
-def _cameras(found: Found, image: Size, first: float | None) -> dict[str, Any]:
+def _cameras(found: Found, image: Pair, form: Format) -> dict[str, Any]:
     """Return a dictionary with the keys of calib.json for the cameras of a file."""
-    views = [view for each in found.cameras if (view := formats.view_of(each, image, first))]
-    if not found.stereo:
-        views = list({repr(view): view for view in views}.values())  # equal ones count as one
-        fitting = [v for v in views if (v.get("width"), v.get("height")) == image]
-        views = fitting if fitting and len(views) > 1 else views
-    if not views or len(views) > 1 + found.stereo:
-        number = (
-            f"{len(views)} different cameras: keep the one" if views else "no cameras: give one"
-        )
-        raise ReconstructionError(f"has {number} of these images")
-    baseline_mm = found.baseline_mm or None
-    return {**views[0], "left": views[0], "right": views[-1], "baseline_mm": baseline_mm}
+    views = [view for each in found.cameras if (view := formats.view_of(each, image, form))]
+    fitting = [v for v in views if (v.get("width"), v.get("height")) == image]
+    if found.stereo and (not fitting or views[0] in fitting):
+        baseline_mm = found.baseline_mm or None
+        return {**views[0], "left": views[0], "right": views[:2][-1], "baseline_mm": baseline_mm}
+    different = list({repr(view): view for view in fitting or views}.values())
+    if len(different) != 1:
+        number = f"{len(different)} different cameras" if different else "no cameras"
+        raise ReconstructionError(f"it has {number}: give a file with that of these images")
+    return {**different[0], "left": different[0], "right": different[0]}
