@@ -42,7 +42,7 @@ ORB_SLAM_STEREO = (
     + flat("Camera1", {**ROW, "k1": 0.0})
     + flat("Camera2", {**ROW, "cx": 326.0})
     + "Stereo.ThDepth: 60.0\nStereo.T_c1_c2: !!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: f\n"
-    "  data: [1.0, 0, 0, 0.12, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0]\n"
+    "  data:[1.0, 0, 0, 0.12, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0]\n"
 )
 STELLA = {**ROW, **ZEROS, "cols": 640, "rows": 480, "model": "perspective", "setup": "stereo"}
 ZED = (
@@ -73,7 +73,7 @@ def depthai(**more: Any) -> dict[str, Any]:
 
 
 STEREO = {
-    "ORB-SLAM2": ORB_SLAM + "Camera.bf: 60.0\nThDepth: 35\n",  # 500 px * 0.12 m
+    "ORB-SLAM2": ORB_SLAM + "Camera.bf:\t60.0\nViewer.PointSize:2\n",  # 500 px * 0.12 m
     "ORB-SLAM3, rectified": 'File.version: "1.0"\nCamera.type: "Rectified"\n'
     + flat("Camera", SIDES)
     + flat("Camera1", ROW)

@@ -122,7 +122,11 @@ def _yaml(text: str) -> Any:
     Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # a subclass, to accept OpenCV's tags
     Loader.add_multi_constructor("", lambda loader, _, node: loader.construct_mapping(node, True))
     # ROS ends its file with the start of a second YAML document, so only the first one is read.
-    values = next(yaml.load_all(re.sub(r"\A%YAML[^\n]*\n", "", text), Loader), None)
+    text = re.sub(r"\A%YAML[^\n]*\n", "", text).replace("\t", " ")
+    text = re.sub(
+        r"^( *[\w.]+):(?=[-.\d[])", r"\1: ", text, flags=re.MULTILINE
+    )  # as OpenCV reads it
+    values = next(yaml.load_all(text, Loader), None)
     for key in [*values] if isinstance(values, dict) else ():
         head, dot, tail = str(key).partition(".")
         if dot and isinstance(of_head := values.setdefault(head, {}), dict):
@@ -269,7 +273,7 @@ def _calib_json(values: Values, image: Pair, views: Pair) -> dict[str, Any]:
     names = []
     for form in FORMATS:
         if any(re.fullmatch(form.key, str(each)) for each in values):
-            names.append(form.name)
+            names += [form.name] if form.key != ".*" else []
             try:
                 found = form.read(
                     {**values, "views": views} if form.read is _kitti else values, image
@@ -281,7 +285,7 @@ def _calib_json(values: Values, image: Pair, views: Pair) -> dict[str, Any]:
             except KeyError as error:
                 raise ReconstructionError(f"{form.name} has no {error.args[0]}: add it") from None
     keys = ", ".join(map(str, [*values][:5]))
-    raise ReconstructionError(f"{names[0]} has no cameras, only the keys {keys}: {KNOWN}")
+    raise ReconstructionError(f"{[*names, 'it'][0]} has no cameras, only the keys {keys}: {KNOWN}")
 
 
 def _cameras(found: Found, image: Pair, form: Format) -> dict[str, Any]:
