@@ -126,7 +126,7 @@ def _yaml(text: str) -> Any:
     text = re.sub(
         r"^( *[\w.]+):(?=[-.\d[])", r"\1: ", text, flags=re.MULTILINE
     )  # as OpenCV reads it
-    values = next(yaml.load_all(text, Loader), None)
+    values: Any = next(yaml.load_all(text, Loader), None)
     for key in [*values] if isinstance(values, dict) else ():
         head, dot, tail = str(key).partition(".")
         if dot and isinstance(of_head := values.setdefault(head, {}), dict):
@@ -268,7 +268,7 @@ def _calib_json(values: Values, image: Pair, views: Pair) -> dict[str, Any]:
         for key, value in [item for each in (values, *sides) for item in each.items()]:
             if key not in OWN_KEYS and not isinstance(value, Mapping) and any(numbers_in(value)):
                 known = ", ".join(OWN_KEYS)
-                raise ReconstructionError(f'it has the key "{key}": leave it out, or use {known}')
+                raise ReconstructionError(f"it has the key {key!r}: leave it out, or use {known}")
         return dict(values)
     names = []
     for form in FORMATS:

@@ -126,7 +126,7 @@ def check_pinhole(values: Values) -> None:
         name, numbers = str(key).lower(), numbers_in(value)
         words = value.replace("_", " ") if isinstance(value, str) else ""
         if (MODELS.fullmatch(name) and NO_PINHOLES.search(words)) or ("fisheye" in name and value):
-            raise ReconstructionError(f"it has a camera that is no pinhole ({key}: {value})")
+            raise ReconstructionError(f"it has a camera that is no pinhole ({key}: {value!r})")
         name = name if len(numbers) == 1 else name.rstrip("0123456789")  # K1 may be a matrix
         if DISTORTIONS.fullmatch(name) and not all(abs(number) <= ROUNDING for number in numbers):
             raise ReconstructionError(
@@ -178,7 +178,7 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
     focal = _pair_at(own, FOCAL_LENGTHS)
     if (matrix := matrix_at(values, MATRICES, 9, 12)) is not None:
         focal, centre, first = _of_matrix(matrix, first)
-    elif np.shape(line := own.get("intrinsics")) == (4,):  # fx, fy, cx, cy, as Kalibr has them
+    elif np.shape(line := own.get("intrinsics", ())) == (4,):  # fx, fy, cx, cy, as Kalibr has them
         focal, centre = numbers_in(line)[:2], numbers_in(line)[2:]
     if form.origin == "corner" and not (focal and centre):
         if not centre and not {"fx", "flx", "focalx"} & {*own}:
@@ -222,12 +222,12 @@ ANY = Format("the file", ".*", plain)
 
 def orb_slam(values: Values, image: Pair) -> Found | None:
     """Read settings of ORB-SLAM or stella_vslam. Lengths are in metres, also in fx * baseline."""
-    shared = values.get("Camera", {})
+    shared: Any = values.get("Camera", {})
     if not isinstance(shared, Mapping):
         return None
     check_pinhole(shared)
     found = [{**shared, **values[key]} for key in ("Camera1", "Camera2") if key in values]
-    found, stereo = found or [shared], values.get("Stereo", {})
+    found, stereo = found or [dict(shared)], values.get("Stereo", {})
     metres = float(shared.get("bf", shared.get("focal_x_baseline", 0))) / float(found[0]["fx"])
     metres = metres or float(stereo.get("b", 0))
     metres = metres or math.hypot(*numbers_in(stereo.get("T_c1_c2"))[3:12:4])
