@@ -247,12 +247,12 @@ FORMATS = (
     Format("RealSense's calibration", "ppx", formats.plain),
     Format("DepthAI's calibration", "cameraData", formats.depthai),
     Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", formats.plain, 0.0),
-    Format("OpenMVG's calibration", "sfm_data_version", formats.plain, 0.0),
+    Format("OpenMVG's calibration", "sfm_data_version", formats.openmvg, 0.0),
     Format("Meshroom's calibration", "intrinsics", formats.meshroom, 0.0),
     Format("Metashape's calibration", "metashape", formats.metashape, 0.0, "middle"),
     Format("Bundler's file", "bundler", formats.bundler, 0.0, "middle"),
     Format("MATLAB's calibration", "IntrinsicMatrix|RadialDistortion", formats.plain, 1.0),
-    Format("transforms.json", "fl_x|camera_angle_x|frames", formats.nerfstudio, 0.5),
+    Format("nerfstudio's transforms.json", "fl_x|camera_angle_x|frames", formats.nerfstudio, 0.5),
     Format("OpenSfM's list of cameras", ".*", formats.opensfm, 0.0, "fractions"),
     Format("the file", "matrix", _opencv),
     Format("ROS's calibration", "distortion_model|camera_name|projection_matrix", _opencv),
@@ -268,7 +268,9 @@ def _calib_json(values: Values, image: Pair, views: Pair) -> dict[str, Any]:
         for key, value in [item for each in (values, *sides) for item in each.items()]:
             if key not in OWN_KEYS and not isinstance(value, Mapping) and any(numbers_in(value)):
                 known = ", ".join(OWN_KEYS)
-                raise ReconstructionError(f"it has the key {key!r}: leave it out, or use {known}")
+                raise ReconstructionError(
+                    f"its key {key!r} is not known: use {known}, for images without distortion"
+                )
         return dict(values)
     names = []
     for form in FORMATS:

@@ -126,7 +126,9 @@ def check_pinhole(values: Values) -> None:
         name, numbers = str(key).lower(), numbers_in(value)
         words = value.replace("_", " ") if isinstance(value, str) else ""
         if (MODELS.fullmatch(name) and NO_PINHOLES.search(words)) or ("fisheye" in name and value):
-            raise ReconstructionError(f"it has a camera that is no pinhole ({key}: {value!r})")
+            raise ReconstructionError(
+                f"it has a camera that is no pinhole ({key} {value!r}): undistort the images"
+            )
         name = name if len(numbers) == 1 else name.rstrip("0123456789")  # K1 may be a matrix
         if DISTORTIONS.fullmatch(name) and not all(abs(number) <= ROUNDING for number in numbers):
             raise ReconstructionError(
@@ -161,7 +163,9 @@ def _of_matrix(matrix: np.ndarray, first: float | None) -> tuple[list[float], li
     if not np.allclose(left[2], last) or abs(left[1, 0]) > ROUNDING:
         wrong, right = (left[1], "0 fy cy") if np.allclose(left[2], last) else (left[2], "0 0 1")
         row = " ".join(f"{number:g}" for number in wrong)
-        raise ReconstructionError(f"it has a matrix with the row {row} instead of {right}")
+        raise ReconstructionError(
+            f"it has a matrix with the row {row} instead of {right}: give fx 0 cx; 0 fy cy; 0 0 1"
+        )
     skew = float(left[0, 1])
     check_pinhole({"skew": skew if abs(skew) > ROUNDING * abs(left[0, 0]) else 0})
     (fx, _, cx), (_, fy, cy) = left[:2].tolist()
@@ -220,6 +224,11 @@ def plain(values: Values, image: Pair) -> Found | None:
 ANY = Format("the file", ".*", plain)
 
 
+def openmvg(values: Values, image: Pair) -> Found | None:
+    """Read OpenMVG's sfm_data.json."""
+    return plain({"intrinsics": values["intrinsics"]}, image)
+
+
 def orb_slam(values: Values, image: Pair) -> Found | None:
     """Read settings of ORB-SLAM or stella_vslam. Lengths are in metres, also in fx * baseline."""
     shared: Any = values.get("Camera", {})
@@ -242,7 +251,9 @@ def zed(values: Values, image: Pair) -> Found:
     name = next((name for name, size in sizes.items() if image in (None, size)), None)
     if name is None:
         known = ", ".join(f"{width}x{height}" for width, height in sizes.values())
-        raise ReconstructionError(f"it has no section for this size of images, only for {known}")
+        raise ReconstructionError(
+            f"it has no section for this size of images, only for {known}: resize them"
+        )
     both = (values[f"{side}_CAM_{name}"] for side in ("LEFT", "RIGHT"))
     cameras = [{**each, "resolution": sizes[name]} for each in both]
     return Found(cameras, True, float(values["STEREO"]["Baseline"]))
