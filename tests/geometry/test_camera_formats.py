@@ -248,6 +248,12 @@ def test_matlab_counts_pixels_from_1(tmp_path: Path) -> None:
     assert found.camera0 == CAMERA
 
 
+def test_a_principal_point_that_may_be_relative_to_the_middle_is_told(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="middle"):
+        found = load(tmp_path, {**ROW, "cx": 12.5, "cy": 7.25})
+    assert found.camera0.centre == (12.5, 7.25)
+
+
 def test_a_principal_point_that_is_not_given_is_the_middle(tmp_path: Path) -> None:
     """A field of view of 90 degrees has the focal length 640 / 2 / tan(45 degrees) = 320."""
     bundler = "# Bundle file v0.3\n2 1\n" + "500 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n" * 2
@@ -394,8 +400,9 @@ def test_no_refusal_where_the_number_is_zero(tmp_path: Path) -> None:
     assert load(tmp_path, values).camera0 == Camera(SIZE, 500)
 
 
+@pytest.mark.filterwarnings("ignore:the principal point")
 def test_any_3x3_matrix_is_a_camera_or_refused(tmp_path: Path) -> None:
-    """Ten thousand would take long: two hundred, of which all that are read are their own K."""
+    """Of two hundred random matrices, those that are read are the camera's matrix themselves."""
     generator = np.random.default_rng(5)
     read = 0
     for _ in range(200):

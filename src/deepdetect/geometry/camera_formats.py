@@ -205,6 +205,12 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
             f"it has the focal length {max(focal):g} and the principal point ({x:g}, {y:g}) for "
             f"images of {sides[0]:g}x{sides[1]:g} pixels: check the order and unit of the numbers"
         )
+    if (size or image) and not rectified and math.hypot(x, y) < math.hypot(*(sides / 2 - (x, y))):
+        warnings.warn(
+            f"the principal point ({x:g}, {y:g}) is nearer to the corner of the image than to its "
+            "middle: if it is relative to the middle, add half the width and half the height",
+            stacklevel=2,
+        )
     shape = dict(zip(("width", "height"), map(int, size), strict=False))
     return {"focal_px": focal, "cx": x, "cy": y, **shape}
 
