@@ -97,6 +97,16 @@ def test_what_is_wrong_is_refused_with_its_file(tmp_path: Path, values: Any) -> 
         Calibration.load(tmp_path / "no.json", SIZE, SIZE)
 
 
+def test_a_saved_calibration_is_read_exactly(tmp_path: Path) -> None:
+    left = Camera(SIZE, (1000 / 3, 700.1), (320.1, 1e-3 / 7))
+    for right, baseline in ((left, None), (Camera((600, 400), 1e3 / 7), 193.001)):
+        saved = Calibration(left, right, baseline)
+        saved.save(tmp_path / "of" / "calib.json")
+        found = Calibration.load(tmp_path / "of" / "calib.json")
+        assert (found.camera0, found.camera1) == (left, right)
+        assert found.baseline_mm == baseline
+
+
 def test_the_principal_point_is_the_middle_where_none_is_given() -> None:
     camera = Camera(SIZE, 700)
     np.testing.assert_array_equal(camera.matrix, [[700, 0, 319.5], [0, 700, 239.5], [0, 0, 1]])

@@ -10,11 +10,13 @@ Focal lengths and positions are in pixels, and the centre of the first pixel is 
      "disparity_offset_px": 66.7,   cx right minus cx left; default: computed from the values of cx
      "left": {...}, "right": {...}} values for one view only: focal_px, cx, cy, width, height
 
-Without `baseline_mm`, lengths are in multiples of the baseline. Other keys are ignored.
+Without `baseline_mm`, lengths are in multiples of the baseline. Other numbers are refused, except
+zeros: distortion, for example, would be lost. Other texts and objects are ignored.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -23,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from .._shared.atomic import atomic_path
 from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
 from .._shared.options import numbers_of, shown, suggest_keywords
 from .camera_files import read_camera_file
@@ -190,7 +193,26 @@ class Calibration:
                 format, its cameras have lens distortion, or it is for images of another size.
         """
         with _reading(path):
-            return _calibration(read_camera_file(Path(path), views), size0, size1, str(path))
+            values = read_camera_file(Path(path), size0 and (size0[0], size0[1]), views)
+            return _calibration(values, size0, size1, str(path))
+
+    def save(self, path: str | Path) -> None:
+        """Write the package's own camera file, from which `load` reads the same cameras.
+
+        Example:
+            >>> import tempfile
+            >>> path = Path(tempfile.mkdtemp()) / "calib.json"
+            >>> Calibration(Camera((640, 480), 500), Camera((640, 480), 500), 120).save(path)
+            >>> Calibration.load(path).baseline_mm
+            120.0
+        """
+        values: dict[str, Any] = {"baseline_mm": self.baseline_mm}
+        for side, camera in (("left", self.camera0), ("right", self.camera1)):
+            (cx, cy), (width, height) = camera.centre, camera.size
+            values[side] = {"focal_px": camera.focal_px, "cx": cx, "cy": cy}
+            values[side] |= {"width": width, "height": height}
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
 
     def check_sizes(self, size0: Size, size1: Size) -> None:
         """Raise a `ReconstructionError` unless the calibration is for images of these sizes."""
@@ -206,7 +228,7 @@ class Calibration:
 def check_camera_file(path: str | Path) -> None:
     """Raise a ReconstructionError if a camera file cannot be read; image sizes are not checked."""
     with _reading(path):
-        read_camera_file(Path(path), None)
+        read_camera_file(Path(path))
 
 
 @contextmanager
@@ -251,7 +273,11 @@ def _calibration(
             f"disparity_offset_px is {offset:g}, but cx of the right view minus cx of the left "
             f"is {measured:g}: leave out `disparity_offset_px`, or correct it"
         )
-    calibration.check_sizes(size0, size1)
+    try:
+        calibration.check_sizes(size0, size1)
+    except ReconstructionError as error:
+        whose = values.get("format", "the calibration")
+        raise ReconstructionError(str(error).replace("the calibration", whose, 1)) from None
     return calibration
 
 

@@ -163,21 +163,21 @@ def known_cameras(
 
     Raises a ReconstructionError if the calibration is invalid, or fits no image.
     """
-    known: dict[str, Camera] = {}
+    known: dict[tuple[int, int], Camera] = {}
     problem: ReconstructionError | None = None
-    for name, size in sizes.items():
+    for size in dict.fromkeys(sizes.values()):
         try:
             if isinstance(calibration, (str, Path)):
                 camera = Calibration.load(calibration, size).camera0
             else:
                 camera = calibration if isinstance(calibration, Camera) else calibration.camera0
                 Calibration(camera, camera).check_sizes(size, size)
-            known[name] = camera
+            known[size] = camera
         except ReconstructionError as error:
             problem = error
     if problem is not None and not known:
         raise problem
-    return known
+    return {name: known[size] for name, size in sizes.items() if size in known}
 
 
 def initial_intrinsics(
