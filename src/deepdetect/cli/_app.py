@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.metadata
+import inspect
 import os
 import re
 import sys
@@ -12,7 +13,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
 from cyclopts.help import DefaultFormatter
 
 from .. import __version__
@@ -179,10 +180,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     announce_compilation(lambda: say("compiling (first use only, cached): about 10 seconds"))
     words = list(sys.argv[1:] if arguments is None else arguments)
     warn = warnings.showwarning
+    say_once = functools.cache(lambda text: say(with_flags(text, words)))
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
         if category is UserWarning:
-            say(with_flags(str(message), words))
+            say_once(str(message))
         else:
             warn(message, category, *place, **more)
 
@@ -190,6 +192,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = show
             return _call(words)
+    except UnusedCliTokensError as error:
+        return _failed(_too_many(error), 2)
     except CycloptsError as error:
         return _failed(" ".join(str(error).split()), 2)
     except BatchError as error:
@@ -225,6 +229,16 @@ def _call(words: Sequence[str]) -> int:
     if sys.stdout is not None:
         sys.stdout.flush()
     return code
+
+
+def _too_many(error: UnusedCliTokensError) -> str:
+    """Return a sentence on arguments that are more than a command takes."""
+    parameters = inspect.signature(error.target).parameters.values() if error.target else ()
+    names = [each.name.upper() for each in parameters if each.kind is each.POSITIONAL_ONLY]
+    takes = f"only {' and '.join(names)}" if names else "no arguments but options"
+    given = f"`{' '.join(error.command_chain or ())}` takes {takes}"
+    advice = ", and run the command once for each" if names else ""
+    return f"{given}: leave out {' '.join(error.unused_tokens or ())}{advice}"
 
 
 def _failed(text: str, code: int) -> int:
