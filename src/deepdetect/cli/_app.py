@@ -193,7 +193,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = show
             return _call(words)
     except UnusedCliTokensError as error:
-        return _failed(_too_many(error), 2)
+        parameters = inspect.signature(error.target or main).parameters.values()
+        names = " and ".join(p.name.upper() for p in parameters if p.kind is p.POSITIONAL_ONLY)
+        text = f"`{' '.join(error.command_chain or ())}` takes only {names or 'options'}: leave out"
+        more = ", and run the command once for each" if names else ""
+        return _failed(f"{text} {' '.join(error.unused_tokens or ())}{more}", 2)
     except CycloptsError as error:
         return _failed(" ".join(str(error).split()), 2)
     except BatchError as error:
@@ -229,16 +233,6 @@ def _call(words: Sequence[str]) -> int:
     if sys.stdout is not None:
         sys.stdout.flush()
     return code
-
-
-def _too_many(error: UnusedCliTokensError) -> str:
-    """Return a sentence on arguments that are more than a command takes."""
-    parameters = inspect.signature(error.target).parameters.values() if error.target else ()
-    names = [each.name.upper() for each in parameters if each.kind is each.POSITIONAL_ONLY]
-    takes = f"only {' and '.join(names)}" if names else "no arguments but options"
-    given = f"`{' '.join(error.command_chain or ())}` takes {takes}"
-    advice = ", and run the command once for each" if names else ""
-    return f"{given}: leave out {' '.join(error.unused_tokens or ())}{advice}"
 
 
 def _failed(text: str, code: int) -> int:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -21,33 +21,40 @@ def holds_image(path: Path) -> bool:
     return False
 
 
-def masks_among(paths: Sequence[Path]) -> dict[Path, None]:
-    """Return those of the image files that are named as masks of others.
+def without_masks(paths: Iterable[Path]) -> list[Path]:
+    """Return the image files without those that are named as masks of others; warn about these.
 
     Masks of NAME.jpg are NAME_mask.png, NAME.mask.png, mask_NAME.png and NAME.jpg.png in its
-    folder, and these and NAME.png in a folder `masks` in this folder or next to it. Separators,
-    case and suffixes do not matter.
+    folder, and these and NAME.png below a folder `masks` in this folder or a folder above it.
     """
-    whole = {(path.parent, path.name.casefold()) for path in paths if path.suffix}
-    stems = {(path.parent, path.stem.casefold()) for path in paths}
-    folders = defaultdict[Path, set[Path]](set)  # also by their paths without one of the parts
-    for folder in {path.parent for path in paths}:
-        folders[folder].add(folder)
-        for marked, shorter in _shortened(folder):
-            folders[shorter] |= set() if marked else {folder}
+    paths = [*paths]
+    places = {place for path in paths for place in _around_masks(path)}
+    stems, names = set[tuple[Path, str]](), set[tuple[Path, str]]()
+    for path in paths:
+        stems.add((path.parent, path.stem.casefold()))
+        names |= {(path.parent, path.name.casefold())} if path.suffix else set()
+        for place in places.intersection(path.parents):
+            if not any(map(MASK_WORD.search, path.relative_to(place).parts[:-1])):
+                names |= {(place / "masks", each.casefold()) for each in (path.stem, path.name)}
 
     def is_mask(path: Path) -> bool:
-        plain = MASK_WORD.sub("", path.stem)
-        places = [short for marked, short in _shortened(path.parent) if marked]
-        near = {(f, plain.casefold()) for short in places for f in folders.get(short, ())}
-        own = {(path.parent, plain.casefold())}
-        return bool((own | near) & whole or (near if plain == path.stem else own | near) & stems)
+        name = MASK_WORD.sub("", path.stem).casefold()
+        own = (path.parent, name)
+        near = {(place / "masks", name) for place in _around_masks(path)}
+        return own in names or (name != path.stem.casefold() and own in stems) or bool(near & names)
 
-    return dict.fromkeys(filter(is_mask, paths))
+    masks = [path for path in paths if is_mask(path)]
+    tell_left_out(masks, "files named as masks of other images")
+    return [path for path in paths if path not in {*masks}]
 
 
-def _shortened(folder: Path) -> Iterator[tuple[bool, Path]]:
-    """Yield a path without each of its parts, and whether this part names a folder of masks."""
-    parts = folder.parts
-    for k, part in enumerate(parts):
-        yield MASK_WORD.search(part) is not None, Path(*parts[:k], *parts[k + 1 :])
+def _around_masks(path: Path) -> list[Path]:
+    """Return the folders with a folder of masks in which the path is."""
+    return [folder.parent for folder in path.parents if MASK_WORD.search(folder.name)]
+
+
+def tell_left_out(paths: Sequence[Path], what: str) -> None:
+    """Warn that files are left out."""
+    if paths:
+        text = f"{len(paths)} {what} are left out, such as {paths[0]} (rename them to use them)"
+        warnings.warn(text, UserWarning, stacklevel=4)

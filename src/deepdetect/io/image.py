@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,7 +19,7 @@ from .._shared.image_array import Channels, array_to_rgb, check_channels, deep_v
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import was_made
-from .companions import holds_image, masks_among
+from .companions import holds_image, tell_left_out, without_masks
 from .image_file import (
     IMAGE_SUFFIXES,
     RAW_SUFFIXES,
@@ -31,7 +31,7 @@ from .image_file import (
     open_image,
     reading_options,
 )
-from .tiff import TIFF_STARTS, read_tiff, tell_of_pages
+from .tiff import TIFF_STARTS, page_numbers, read_tiff
 
 Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
@@ -240,8 +240,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     made = {path for path in files if was_made(path, root)}
     names = {path.name for path in found}  # ortho.tif.ovr belongs to ortho.tif
     others = sorted(p for p in {*files} - {*found} - made if p.stem not in names and holds_image(p))
-    if others:
-        _tell_left_out(others, "images with an unknown suffix")
+    tell_left_out(others, "images with unknown suffixes")
     if not found:
         raise ImageError(
             f"there is no image in {root}: it needs files that end in .jpg, .png, .tif or similar"
@@ -249,20 +248,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     images = [path for path in found if path not in made]
     if not images:
         raise ImageError(f"all images in {root} are results of earlier runs: give files by name")
-    return _without_masks(images)
-
-
-def _without_masks(images: Iterable[Path]) -> list[Path]:
-    masks = masks_among(images := [*images])
-    if masks:
-        _tell_left_out([*masks], "masks of other images, by their names,")
-    return [path for path in images if path not in masks]
-
-
-def _tell_left_out(paths: Sequence[Path], what: str) -> None:
-    more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-    text = f"{what} are left out: {paths[0]}{more} (rename them to use them)"
-    warnings.warn(text, UserWarning, stacklevel=3)
+    return without_masks(images)
 
 
 def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str, Path]:
@@ -275,7 +261,7 @@ def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str
     for path in paths:
         below = find_images(path, exclude) if path.is_dir() else [path]
         names |= {each: each.relative_to(path if path.is_dir() else path.parent) for each in below}
-    names = {path: names[path] for path in _without_masks(names)}
+    names = {path: names[path] for path in without_masks(names)}
     if len({*names.values()}) < len(names):
         top = os.path.commonpath([path.parent.absolute() for path in names])
         names = {path: path.absolute().relative_to(top) for path in names}
@@ -299,8 +285,12 @@ def _read_file(
                     rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
                 orientation, several = orientation_of(image), hasattr(image, "n_frames")
             del image  # frees its pixels before `UPRIGHT` makes another copy
-        if several and options.page is None:
-            tell_of_pages(file, name)
+        count = 1
+        with suppress(Exception):  # a file may be damaged behind its first image
+            count = len(page_numbers(file)) if several and options.page is None else 1
+        if count > 1:
+            text = f"{name} holds {count} images, of which one is taken: choose it by `page`"
+            warnings.warn(text, UserWarning, stacklevel=2)
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 import io
 import logging
 import os
-import warnings
-from contextlib import suppress
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -125,14 +123,6 @@ def page_numbers(source: Any) -> list[int]:
                 sizes = [image.seek(k) or image.size for k in range(count)]
     width, height = np.max(sizes, axis=0)
     return [k for k, (w, h) in enumerate(sizes) if 2 * w > width and 2 * h > height]
-
-
-def tell_of_pages(file: BinaryIO, name: str) -> None:
-    """Warn if a file holds several images, of which one is read."""
-    with suppress(Exception):  # a file whose first image can be read may be damaged behind it
-        if (count := len(page_numbers(file))) > 1:
-            text = f"{name} holds {count} images, of which one is taken: choose it by `page`"
-            warnings.warn(text, UserWarning, stacklevel=2)
 
 
 def _checked_kind(page: Any, name: str) -> int:

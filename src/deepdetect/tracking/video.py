@@ -146,7 +146,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             raise BatchError(f"none of {count} frames can be read", self.failures)
 
     def _from_capture(self) -> Iterator[Frame]:
-        first = None
+        first = np.empty(0)
         for number in count():
             wanted = number % self.every == 0
             # `grab` skips a frame without decoding it, if the format allows it.
@@ -154,10 +154,11 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             if not done:
                 break
             if wanted:
-                if number == self.every and not self.live and np.array_equal(bgr, first):
+                rgb = load_image(bgr, channels="bgr")
+                first = rgb if number == 0 else first
+                if number == self.every and not self.live and np.array_equal(rgb, first):
                     _check_decoded(self.path)
-                first = bgr
-                yield Frame(number, load_image(bgr, channels="bgr"))
+                yield Frame(number, rgb)
         if not number:
             raise DeepDetectError("the source has no frames: check it with another program")
 
