@@ -288,9 +288,9 @@ def _read_file(
         count = 1
         with suppress(Exception):  # a file may be damaged behind its first image
             count = len(page_numbers(file)) if several and options.page is None else 1
-        if count > 1:
-            text = f"{name} holds {count} images, of which one is taken: choose it by `page`"
-            warnings.warn(text, UserWarning, stacklevel=2)
+    if count > 1:
+        text = f"{name} holds {count} images, of which one is taken: choose it by `page`"
+        warnings.warn(text, UserWarning, stacklevel=4)
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 

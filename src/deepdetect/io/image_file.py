@@ -356,7 +356,7 @@ def identify(file: BinaryIO, name: str, formats: Iterable[str] = FORMATS) -> Any
         raise MissingExtraError(f"{name} is a {kind} image: run pip install {plugin} to read it")
     if re.match(VIDEO, start):
         raise ImageError(
-            f"{name} is a video: take frames from it, such as by ffmpeg -i {name} -vf fps=5 "
+            f'{name} is a video: take frames from it, such as by ffmpeg -i "{name}" -vf fps=5 '
             "frames/%05d.jpg (docs/reconstruction.md), and give these"
         )
     raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG")

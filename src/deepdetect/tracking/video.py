@@ -184,7 +184,7 @@ def _check_decoded(path: Path) -> None:
     if packets and len({*packets}) == len(packets):
         raise InvalidFileError(
             f"{text}, but should not be, as where the installed OpenCV fails with interlaced "
-            f"videos: convert it, such as by ffmpeg -i {path} -vf yadif progressive.mp4"
+            f'videos: convert it, such as by ffmpeg -i "{path}" -vf yadif progressive.mp4'
         )
     warnings.warn(f"{text}: check that nothing moves in them", UserWarning, stacklevel=2)
 
