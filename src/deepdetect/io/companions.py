@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Iterable, Sequence
@@ -25,32 +26,27 @@ def without_masks(paths: Iterable[Path]) -> list[Path]:
     """Return the image files without those that are named as masks of others; warn about these.
 
     Masks of NAME.jpg are NAME_mask.png, NAME.mask.png, mask_NAME.png and NAME.jpg.png in its
-    folder, and these and NAME.png below a folder `masks` in this folder or a folder above it.
+    folder, and these and NAME.png below a folder `masks`.
     """
     paths = [*paths]
-    places = {place for path in paths for place in _around_masks(path)}
-    stems, names = set[tuple[Path, str]](), set[tuple[Path, str]]()
-    for path in paths:
-        stems.add((path.parent, path.stem.casefold()))
-        names |= {(path.parent, path.name.casefold())} if path.suffix else set()
-        for place in places.intersection(path.parents):
-            if not any(map(MASK_WORD.search, path.relative_to(place).parts[:-1])):
-                names |= {(place / "masks", each.casefold()) for each in (path.stem, path.name)}
+    folders = {path.parent: path.parent.absolute() for path in paths}
+    root = os.path.commonpath([*folders.values()]) if paths else ""
+    marked = {
+        k for k, v in folders.items() if any(map(MASK_WORD.search, v.relative_to(root).parts))
+    }
+    stems = {(path.parent, path.stem.casefold()) for path in paths}
+    names = {(path.parent, path.name.casefold()) for path in paths if path.suffix}
+    photographs = {name for folder, name in stems | names if folder not in marked}
 
     def is_mask(path: Path) -> bool:
         name = MASK_WORD.sub("", path.stem).casefold()
-        own = (path.parent, name)
-        near = {(place / "masks", name) for place in _around_masks(path)}
-        return own in names or (name != path.stem.casefold() and own in stems) or bool(near & names)
+        own, changed = (path.parent, name), name != path.stem.casefold()
+        beside = own in names or (changed and own in stems)
+        return beside or (path.parent in marked and name in photographs)
 
-    masks = [path for path in paths if is_mask(path)]
-    tell_left_out(masks, "files named as masks of other images")
-    return [path for path in paths if path not in {*masks}]
-
-
-def _around_masks(path: Path) -> list[Path]:
-    """Return the folders with a folder of masks in which the path is."""
-    return [folder.parent for folder in path.parents if MASK_WORD.search(folder.name)]
+    masks = dict.fromkeys(filter(is_mask, paths))
+    tell_left_out([*masks], "files named as masks of other images")
+    return [path for path in paths if path not in masks]
 
 
 def tell_left_out(paths: Sequence[Path], what: str) -> None:

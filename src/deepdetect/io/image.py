@@ -285,11 +285,11 @@ def _read_file(
                     rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
                 orientation, several = orientation_of(image), hasattr(image, "n_frames")
             del image  # frees its pixels before `UPRIGHT` makes another copy
-        count = 1
+        pages: list[int] = []
         with suppress(Exception):  # a file may be damaged behind its first image
-            count = len(page_numbers(file)) if several and options.page is None else 1
-    if count > 1:
-        text = f"{name} holds {count} images, of which one is taken: choose it by `page`"
+            pages = page_numbers(file) if several and options.page is None else []
+    if len(pages) > 1:
+        text = f"{name} holds {len(pages)} images, of which one is taken: choose it by `page`"
         warnings.warn(text, UserWarning, stacklevel=4)
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 

@@ -347,10 +347,8 @@ def identify(file: BinaryIO, name: str, formats: Iterable[str] = FORMATS) -> Any
                 return factory(file, "")
         except (SyntaxError, IndexError, TypeError, struct.error) as error:
             if key == "JPEG" and "-bit" in str(error):
-                raise ImageError(
-                    f"{name} is a JPEG image that Pillow does not read ({error}): read it with "
-                    "imagecodecs, and give the array"
-                ) from None
+                text = f"{name} is a JPEG image that Pillow does not read ({error})"
+                raise ImageError(f"{text}: read it with imagecodecs, give the array") from None
     if plugin:
         kind = PLUGINS[plugin][2]
         raise MissingExtraError(f"{name} is a {kind} image: run pip install {plugin} to read it")

@@ -34,8 +34,8 @@ MAX_FPS = 1000.0
 """If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
 FIRST_FRAMES = 25
-"""Of this many frames, at most one second, equal ones have some equal packets: the counters in the
-headers of H.264 start again after 16 frames, and groups of MPEG pictures after 12 to 15."""
+"""This many frames are compared: if all are equal, so are some of their packets, since counters in
+the headers of H.264 start again after 16 frames, and MPEG's groups of pictures after 12 to 15."""
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 
