@@ -205,7 +205,7 @@ def _choose_pairs(
             f"{name} in {pairs} is not one of the images: give its path relative to the folder"
         )
     if not wanted:
-        load_image(*paths.values())  # fails for a video, with advice
+        load_image(min(paths.values()))  # fails for a video, with advice
         raise OptionError("one image makes no pair: give two or more images, or a folder")
     stems = {path: stem.replace("/", "-") for path, stem in cli.result_stems(paths).items()}
     chosen = [(paths[name0], paths[name1]) for name0, name1 in wanted]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from collections.abc import Iterable, Sequence
@@ -29,11 +28,9 @@ def without_masks(paths: Iterable[Path]) -> list[Path]:
     folder, and these and NAME.png below a folder `masks`.
     """
     paths = [*paths]
-    folders = {path.parent: path.parent.absolute() for path in paths}
-    root = os.path.commonpath([*folders.values()]) if paths else ""
-    marked = {
-        k for k, v in folders.items() if any(map(MASK_WORD.search, v.relative_to(root).parts))
-    }
+    folders = {path.parent for path in paths}
+    shared = set.intersection(*({*folder.parts} for folder in folders or {Path()}))
+    marked = {each for each in folders if any(map(MASK_WORD.search, {*each.parts} - shared))}
     stems = {(path.parent, path.stem.casefold()) for path in paths}
     names = {(path.parent, path.name.casefold()) for path in paths if path.suffix}
     photographs = {name for folder, name in stems | names if folder not in marked}
