@@ -49,5 +49,6 @@ def without_masks(paths: Iterable[Path]) -> list[Path]:
 def tell_left_out(paths: Sequence[Path], what: str) -> None:
     """Warn that files are left out."""
     if paths:
-        text = f"{len(paths)} {what} are left out, such as {paths[0]} (rename them to use them)"
+        first = Path(*paths[0].parts[-2:])  # the same sentence for an absolute path
+        text = f"{len(paths)} {what} are left out, such as {first} (rename them to use them)"
         warnings.warn(text, UserWarning, stacklevel=4)

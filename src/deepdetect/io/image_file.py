@@ -348,7 +348,7 @@ def identify(file: BinaryIO, name: str, formats: Iterable[str] = FORMATS) -> Any
         except (SyntaxError, IndexError, TypeError, struct.error) as error:
             if key == "JPEG" and "-bit" in str(error):
                 text = f"{name} is a JPEG image that Pillow does not read ({error})"
-                raise ImageError(f"{text}: read it with imagecodecs, give the array") from None
+                raise ImageError(f"{text}: give the array that imagecodecs reads") from None
     if plugin:
         kind = PLUGINS[plugin][2]
         raise MissingExtraError(f"{name} is a {kind} image: run pip install {plugin} to read it")
