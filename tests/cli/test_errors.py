@@ -29,6 +29,7 @@ def bad(tmp_path: Path, photos: Path) -> Path:
     (folder / "weights.pth").write_bytes(b"\x80\x04K\x01.")
     Image.new("L", (15, 40)).save(folder / "small.png")
     (folder / "matrix.txt").write_text("1 2\n3 4\n")
+    (folder / "video.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
     return folder
 
 
@@ -52,6 +53,23 @@ CASES = {
     "train nothing": "train {bad}/empty -o {bad}/out",
     "label settings": "label {bad}/good.png -o {bad}/out --label-settings {bad}/no.toml",
     "evaluate nothing": "dev evaluate {bad}/empty",
+    "three images to register": "register {bad}/good.png {bad}/good.png {bad}/good.png",
+    "three images for a pose": "pose {bad}/good.png {bad}/good.png {bad}/good.png",
+    "two folders": "extract {bad} {bad}",
+    "two videos": "track {bad}/video.mp4 {bad}/video.mp4",
+    "an argument for no command": "doctor {bad}",
+    "three images to view": "view {bad}/good.png {bad}/good.png {bad}/good.png {bad}/good.png",
+    **{
+        f"a video to {words}": words.replace("IMAGE", "{bad}/good.png").replace(
+            "VIDEO", "{bad}/video.mp4"
+        )
+        for words in (
+            *("detect VIDEO", "match VIDEO", "match IMAGE VIDEO", "register IMAGE VIDEO"),
+            *("stitch VIDEO", "pose VIDEO IMAGE", "reconstruct VIDEO", "reconstruct IMAGE VIDEO"),
+            *("reconstruct IMAGE IMAGE VIDEO", "extract VIDEO"),
+            "detect IMAGE --ignore VIDEO",
+        )
+    },
     "long name of a folder": "detect {bad}/good.png -o {bad}/{long}",
     "long name of a file": "export onnx dense -o {bad}/{long}.onnx",
     "long name of pictures": "register {bad}/good.png {bad}/good.png -o {bad}/{long}/out",
@@ -67,6 +85,7 @@ def test_one_sentence_and_exit_code_2(run, bad: Path, arguments: str) -> None:
     assert result.exit_code == 2, result.output
     assert result.stderr.startswith("deepdetect: ")
     assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+    assert "video" in result.stderr or "video" not in arguments
     assert {path: path.read_bytes() for path in bad.rglob("*") if path.is_file()} == before
 
 

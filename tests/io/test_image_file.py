@@ -12,8 +12,10 @@ import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path, PurePath
+from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import EpsImagePlugin, Image
@@ -249,6 +251,45 @@ def test_without_pillow_heif_its_name_is_said(
 )
 def test_what_is_no_photograph_is_called_what_it_is(content: bytes, name: str) -> None:
     with pytest.raises(ImageError, match=name):
+        load_image(content)
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mp4", ".mov", ".mkv", ".mpg", ".ts", ".webm"])
+def test_a_video_is_called_a_video(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"clip{suffix}"
+    codes = {".avi": "MJPG", ".mpg": "MPEG", ".ts": "mpg2", ".webm": "VP80"}
+    code = cv2.VideoWriter_fourcc(*codes.get(suffix, "mp4v"))
+    writer = cv2.VideoWriter(str(path), cv2.CAP_ANY, code, 25, (64, 64))
+    if not writer.isOpened():
+        pytest.skip("the installed OpenCV does not write it")
+    for k in range(3):
+        writer.write(np.full((64, 64, 3), 60 * k, np.uint8))
+    writer.release()
+    for source in (path, path.read_bytes()):
+        with pytest.raises(ImageError, match="video"):
+            load_image(source)
+
+
+@pytest.mark.parametrize("start", [b"\xff\n", b"\0\0\0\x0cJXL \r\n\x87\n"])
+def test_jpeg_xl_is_read_by_a_plug_in_or_refused_by_its_name(
+    start: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_jxl", None)
+    with pytest.raises(MissingExtraError, match="pillow-jxl-plugin"):
+        load_image(start + bytes(200))
+    plugin = ModuleType("pillow_jxl")
+    monkeypatch.setitem(sys.modules, "pillow_jxl", plugin)
+    Image.init()
+    red = lambda *_: Image.new("RGB", (20, 16), "red")  # noqa: E731
+    monkeypatch.setitem(Image.OPEN, "JXL", (red, lambda begins: begins.startswith(start)))
+    assert load_image(start + bytes(200))[0, 0].tolist() == [255, 0, 0]
+
+
+def test_jpeg_of_12_bits_is_refused_with_what_reads_it() -> None:
+    imagecodecs = pytest.importorskip("imagecodecs")
+    values = np.tile(np.linspace(0, 4095, 64).astype(np.uint16), (32, 1))
+    content = imagecodecs.jpeg8_encode(values, bitspersample=12)
+    with pytest.raises(ImageError, match="imagecodecs"):
         load_image(content)
 
 

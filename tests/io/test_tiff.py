@@ -15,6 +15,7 @@ from PIL import Image
 import deepdetect
 from deepdetect import DeepDetectError, load_image
 from deepdetect._shared.errors import ImageError, MissingExtraError
+from deepdetect.io.tiff import page_numbers
 
 RNG = np.random.default_rng(5)
 GREY = RNG.integers(0, 256, (20, 30), dtype=np.uint8)
@@ -50,6 +51,7 @@ def test_the_same_pixels_stored_in_any_way_are_the_same_image(
             np.testing.assert_array_equal(load_image(predicted), load_image(colour))
 
 
+@pytest.mark.filterwarnings("ignore:.*`page`")
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_what_tifffile_writes_is_read_as_it_reads_it(seed: int) -> None:
@@ -160,8 +162,10 @@ def test_the_full_image_is_read_and_further_pages_by_number() -> None:
         writer.write(~GREY)
         writer.write(GREY[:17, :18].copy())
     content = file.getvalue()
-    for page, expected in ((None, GREY), (0, GREY), (1, ~GREY), (2, GREY[:17, :18])):
+    for page, expected in ((0, GREY), (1, ~GREY), (2, GREY[:17, :18])):
         np.testing.assert_array_equal(load_image(content, page=page), triple(expected))
+    with pytest.warns(UserWarning, match="page"):
+        np.testing.assert_array_equal(load_image(content), triple(GREY))
     with pytest.raises(ImageError, match="`page`"):
         load_image(content, page=3)
     file = io.BytesIO()
@@ -171,13 +175,32 @@ def test_the_full_image_is_read_and_further_pages_by_number() -> None:
     np.testing.assert_array_equal(load_image(file.getvalue()), triple(GREY))
 
 
-def test_pages_of_other_formats() -> None:
+@pytest.mark.parametrize("kind", ["GIF", "PNG", "WEBP", "MPO"])
+def test_pages_of_other_formats(kind: str) -> None:
     frames = [Image.fromarray(GREY), Image.fromarray(~GREY)]
     file = io.BytesIO()
-    frames[0].save(file, "GIF", save_all=True, append_images=frames[1:])
-    np.testing.assert_array_equal(load_image(file.getvalue(), page=1), triple(~GREY))
+    options = {"lossless": True} if kind == "WEBP" else {"quality": 100} if kind == "MPO" else {}
+    frames[0].save(file, kind, save_all=True, append_images=frames[1:], **options)
+    with pytest.warns(UserWarning, match="page"):
+        first = load_image(file.getvalue())
+    for image, expected in ((first, GREY), (load_image(file.getvalue(), page=1), ~GREY)):
+        assert np.abs(image - triple(expected).astype(int)).max() <= 2 * (kind == "MPO")
+    assert page_numbers(file.getvalue()) == [0, 1]
     with pytest.raises(ImageError, match="2 pages"):
         load_image(file.getvalue(), page=2)
+
+
+def test_previews_and_pyramids_are_no_pages() -> None:
+    half, file = GREY[::2, ::2], io.BytesIO()
+    with tifffile.TiffWriter(file) as writer:  # as of a slide scanner, without tags
+        for level in (GREY, half, half[::2, ::2]):
+            writer.write(level.copy())
+    np.testing.assert_array_equal(load_image(file.getvalue()), triple(GREY))  # without a warning
+    file = io.BytesIO()  # as of a phone, with a preview
+    images = [Image.fromarray(each.copy()) for each in (GREY, half)]
+    images[0].save(file, "MPO", save_all=True, append_images=images[1:])
+    assert load_image(file.getvalue()).shape[:2] == GREY.shape
+    assert page_numbers(file.getvalue()) == [0]
 
 
 def test_what_is_no_data_is_black() -> None:

@@ -1,15 +1,18 @@
 from __future__ import annotations
 
+import re
 import signal
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
 from deepdetect import DeepDetectError, ImageError, OptionError
-from deepdetect._shared.errors import BatchError, MissingFileError
+from deepdetect._shared.errors import BatchError, InvalidFileError, MissingFileError
 from deepdetect.tracking import FrameSource
 from deepdetect.tracking.video import CODECS, write_video
 
@@ -53,6 +56,70 @@ def test_an_image_that_is_no_frame_is_left_out(frame_folder, moving_photo) -> No
         path.write_bytes(b"no image")
     with FrameSource(frame_folder) as source, pytest.raises(BatchError):
         next(iter(source))
+
+
+def test_the_pages_of_an_image_file_are_frames(moving_photo, tmp_path: Path) -> None:
+    frames = [moving_photo(k) for k in range(4)]
+    tifffile.imwrite(tmp_path / "stack.TIF", np.stack(frames), photometric="rgb")
+    images = [Image.fromarray(frame) for frame in frames]
+    images[0].save(tmp_path / "moving.png", save_all=True, append_images=images[1:])
+    for name in ("stack.TIF", "moving.png"):
+        with FrameSource(tmp_path / name, every=2) as source:
+            assert source.count == 2
+            for frame in source:
+                np.testing.assert_array_equal(frame.rgb, frames[frame.number])
+    with tifffile.TiffWriter(tmp_path / "pyramid.tif") as writer:
+        for step in (1, 2, 4):
+            writer.write(frames[0][::step, ::step].copy(), photometric="rgb")
+    with pytest.raises(ImageError, match="single"):
+        FrameSource(tmp_path / "pyramid.tif")
+
+
+def interlaced(mpeg2: bytes) -> bytes:
+    """Set the flags of an MPEG-2 video (ISO/IEC 13818-2, 6.2) that say that it is interlaced."""
+    changed = bytearray(mpeg2)
+    for found in re.finditer(rb"\x00\x00\x01\xb5[\x10-\x1f\x80-\x8f]", mpeg2):
+        start = found.start() + 4
+        if changed[start] >> 4 == 1:
+            changed[start + 1] &= 0xF7  # progressive_sequence
+        else:
+            changed[start + 3] &= 0xFE  # chroma_420_type
+            changed[start + 4] &= 0x7F  # progressive_frame
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("suffix", [".mpg", ".ts", ".mkv", ".avi"])
+def test_interlaced_videos_give_their_frames_or_none(
+    suffix: str, moving_photo, tmp_path: Path
+) -> None:
+    path, photo = tmp_path / f"plain{suffix}", moving_photo(0)
+    shape, code = (photo.shape[1], photo.shape[0]), cv2.VideoWriter_fourcc(*"mpg2")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, 25, shape)
+    if not writer.isOpened():
+        pytest.skip("the installed OpenCV does not write MPEG-2")
+    for k in range(6):
+        writer.write(moving_photo(k)[..., ::-1].copy())
+    writer.release()
+    (tmp_path / f"interlaced{suffix}").write_bytes(interlaced(path.read_bytes()))
+
+    def errors(name: str) -> list[float]:
+        with FrameSource(tmp_path / f"{name}{suffix}") as source:
+            return [np.abs(f.rgb.astype(int) - moving_photo(f.number)).mean() for f in source]
+
+    assert max(errors("plain")) < 12
+    with suppress(InvalidFileError):  # OpenCV 4.14 and 5.0 decode nothing
+        assert max(errors("interlaced")) < 12
+
+
+def test_a_video_in_which_nothing_moves_is_read_and_told(moving_photo, tmp_path: Path) -> None:
+    shape = moving_photo(0).shape[1::-1]
+    path, code = tmp_path / "still.avi", cv2.VideoWriter_fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_OPENCV_MJPEG, code, 25, shape)
+    for _ in range(6):
+        writer.write(moving_photo(0)[..., ::-1].copy())
+    writer.release()
+    with FrameSource(path) as source, pytest.warns(UserWarning, match="moves"):
+        assert len(list(source)) == 6
 
 
 class Camera:

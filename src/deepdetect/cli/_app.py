@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.metadata
+import inspect
 import os
 import re
 import sys
@@ -12,7 +13,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
 from cyclopts.help import DefaultFormatter
 
 from .. import __version__
@@ -179,10 +180,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     announce_compilation(lambda: say("compiling (first use only, cached): about 10 seconds"))
     words = list(sys.argv[1:] if arguments is None else arguments)
     warn = warnings.showwarning
+    say_once = functools.cache(lambda text: say(with_flags(text, words)))
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
         if category is UserWarning:
-            say(with_flags(str(message), words))
+            say_once(str(message))
         else:
             warn(message, category, *place, **more)
 
@@ -190,6 +192,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = show
             return _call(words)
+    except UnusedCliTokensError as error:
+        parameters = inspect.signature(error.target or main).parameters.values()
+        names = " and ".join(p.name.upper() for p in parameters if p.kind is p.POSITIONAL_ONLY)
+        text = f"`{' '.join(error.command_chain or ())}` takes only {names or 'options'}: leave out"
+        more = ", and run the command once for each" if names else ""
+        return _failed(f"{text} {' '.join(error.unused_tokens or ())}{more}", 2)
     except CycloptsError as error:
         return _failed(" ".join(str(error).split()), 2)
     except BatchError as error:

@@ -205,6 +205,7 @@ def _choose_pairs(
             f"{name} in {pairs} is not one of the images: give its path relative to the folder"
         )
     if not wanted:
+        load_image(min(paths.values()))  # fails for a video, with advice
         raise OptionError("one image makes no pair: give two or more images, or a folder")
     stems = {path: stem.replace("/", "-") for path, stem in cli.result_stems(paths).items()}
     chosen = [(paths[name0], paths[name1]) for name0, name1 in wanted]
@@ -368,6 +369,8 @@ def stitch(
             load_image(path)
             carried.append(read_metadata(path, placed=flat))
             images.append(path)
+    if failures and len(paths) == 1:
+        raise ImageError(failures[0])
     if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):
         what = "too few images can be read, or the reference cannot"
         raise ImageError(f"there is no panorama, because {what}: {'; '.join(failures)}")

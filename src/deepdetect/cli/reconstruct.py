@@ -12,6 +12,7 @@ from typing import Any
 from .._shared.errors import OptionError
 from .._shared.progress import stage_progress
 from .._shared.records import Outputs
+from ..io.image import load_image
 from ..io.point_cloud import find_writer
 from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import estimate_pose
@@ -108,6 +109,7 @@ def reconstruct(
     if folders and len(images) > 1:
         raise OptionError("give either one folder or only image files")
     if len(images) == 1 and not folders:
+        load_image(images[0])  # fails for a video, with advice
         raise OptionError("give two or more images, or a folder")
     if len(images) > 2 or folders:
         folder = output / "model" if output == Path("deepdetect-output") else output

@@ -27,14 +27,14 @@ FRAMES = cli.From(
 
 @cli.command(FRAMES, TRACKING, cli.READING)
 def track(
-    source: Annotated[str, Parameter(help="Video file, folder of frames, or number of a camera.")],
+    source: Annotated[str, Parameter(help="Video, stack or folder of frames, or camera number.")],
     /,
     *,
     output: cli.Output = Path("tracks.mp4"),
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Track keypoints through a video file, a folder of frames, or the images of a camera.
+    """Track keypoints through a video, a TIFF of frames, a folder, or the images of a camera.
 
     Writes a video that shows the points, their last positions and the frames processed per second,
     and a table of all tracks (.csv) with the columns frame, track, x, y and score. A recording of a

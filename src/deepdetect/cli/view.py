@@ -39,6 +39,8 @@ def view(
     if not file.is_file():
         raise MissingFileError(f"there is no file {file}: give one that another command wrote")
     numbers: dict[str, object] = {}
+    if len(images) > 2:
+        raise OptionError("give one image for keypoints, or two for matches")
     if images:
         result = load_keypoints(file) if len(images) == 1 else load_matches(file)
         picture = result.draw(*map(load_image, images))

@@ -6,8 +6,9 @@ Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,6 +19,7 @@ from .._shared.image_array import Channels, array_to_rgb, check_channels, deep_v
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import was_made
+from .companions import holds_image, tell_left_out, without_masks
 from .image_file import (
     IMAGE_SUFFIXES,
     RAW_SUFFIXES,
@@ -29,7 +31,7 @@ from .image_file import (
     open_image,
     reading_options,
 )
-from .tiff import TIFF_STARTS, read_tiff
+from .tiff import TIFF_STARTS, page_numbers, read_tiff
 
 Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
@@ -212,7 +214,8 @@ def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """List the image files below a folder in natural order: "2.png" comes before "10.png".
 
-    Images that commands of this package have written into the folder are left out.
+    Images that commands of this package have written into the folder are left out. With a warning,
+    so are masks of other images, and images with other suffixes than `IMAGE_SUFFIXES`.
 
     Raises:
         ImageError: the folder is missing, is a file, or has no image outside of `exclude`.
@@ -221,29 +224,31 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
 
     root = Path(folder)
     if root.is_file():
+        load_image(root)  # fails for a video, with advice
         raise ImageError(f"{root} is a file: name the folder that it is in")
     if not root.is_dir():
         raise MissingImageError(f"there is no folder {root}: check the path")
     left_out = [p.resolve() for p in exclude if not root.resolve().is_relative_to(p.resolve())]
-    found = natsorted(
-        (
-            path
-            for path in root.rglob("*")
-            if path.suffix.lower() in IMAGE_SUFFIXES
-            and path.is_file()
-            and not any(part.startswith(".") for part in path.relative_to(root).parts)
-            and not any(path.resolve().is_relative_to(other) for other in left_out)
-        ),
-        alg=ns.PATH,
-    )
+    files = [
+        path
+        for path in root.rglob("*")
+        if path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(root).parts)
+        and not any(path.resolve().is_relative_to(other) for other in left_out)
+    ]
+    found = natsorted((p for p in files if p.suffix.lower() in IMAGE_SUFFIXES), alg=ns.PATH)
+    made = {path for path in files if was_made(path, root)}
+    names = {path.name for path in found}  # ortho.tif.ovr belongs to ortho.tif
+    others = sorted(p for p in {*files} - {*found} - made if p.stem not in names and holds_image(p))
+    tell_left_out(others, "images with unknown suffixes")
     if not found:
         raise ImageError(
             f"there is no image in {root}: it needs files that end in .jpg, .png, .tif or similar"
         )
-    images = [path for path in found if not was_made(path, root)]
+    images = [path for path in found if path not in made]
     if not images:
         raise ImageError(f"all images in {root} are results of earlier runs: give files by name")
-    return images
+    return without_masks(images)
 
 
 def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str, Path]:
@@ -256,6 +261,7 @@ def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str
     for path in paths:
         below = find_images(path, exclude) if path.is_dir() else [path]
         names |= {each: each.relative_to(path if path.is_dir() else path.parent) for each in below}
+    names = {path: names[path] for path in without_masks(names)}
     if len({*names.values()}) < len(names):
         top = os.path.commonpath([path.parent.absolute() for path in names])
         names = {path: path.absolute().relative_to(top) for path in names}
@@ -266,7 +272,7 @@ def _read_file(
     source: Any, options: ReadingOptions, deep: bool = False, raw: bool = False
 ) -> np.ndarray:
     with open_file(source) as (file, name):
-        start = file.read(HEADER_BYTES)
+        start, several = file.read(HEADER_BYTES), True
         if start[:4] in TIFF_STARTS and not name.lower().endswith(RAW_SUFFIXES):
             rgb, orientation = read_tiff(file, name, options, deep, raw)
         elif options.bands is not None and not raw:
@@ -277,8 +283,14 @@ def _read_file(
                     rgb = _deep_png(file, name, options, deep)
                 else:
                     rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
-                orientation = orientation_of(image)
+                orientation, several = orientation_of(image), hasattr(image, "n_frames")
             del image  # frees its pixels before `UPRIGHT` makes another copy
+        pages: list[int] = []
+        with suppress(Exception):  # a file may be damaged behind its first image
+            pages = page_numbers(file) if several and options.page is None else []
+    if len(pages) > 1:
+        text = f"{name} holds {len(pages)} images, of which one is taken: choose it by `page`"
+        warnings.warn(text, UserWarning, stacklevel=4)
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 

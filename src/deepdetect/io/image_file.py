@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import io
 import math
 import os
+import re
 import stat
 import struct
 import sys
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -31,9 +33,9 @@ from .._shared.errors import (
 from .._shared.options import shown, suggest_keywords, whole
 
 FORMATS = {
-    "JPEG": ".jpg .jpeg .jpe .jfif",
-    "PNG": ".png",
-    "TIFF": ".tif .tiff",
+    "JPEG": ".jpg .jpeg .jpe .jfif .jfi .jif .mpo .jps .insp",
+    "PNG": ".png .apng .pns",
+    "TIFF": ".tif .tiff .btf .tf2 .tf8 .gtiff .ptif .svs .ndpi .scn .qptiff .bif .lsm",
     "WEBP": ".webp",
     "BMP": ".bmp",
     "DIB": ".dib",
@@ -71,16 +73,28 @@ IMAGE_SUFFIXES = (*" ".join([*FORMATS.values(), *_OTHERS]).split(), *RAW_SUFFIXE
 MAX_MEGAPIXELS = 200.0
 """Images with more megapixels are rejected by default. The largest phone sensors have 200."""
 
-SIGNATURE_BYTES = 132
-"""Formats are recognised by this many first bytes: DICOM's signature is in bytes 128 to 131."""
+SIGNATURE_BYTES = 200
+"""Formats are recognised by this many first bytes: those of DICOM are bytes 128 to 131, and those
+of an MPEG transport stream in its first two packets."""
 
 STANDARD_INPUT = "/dev/stdin"
 """This path means standard input on every system. For commands, "-" does so as well."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
-HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
-"""HEIF files, which phones write, have one of these brands in bytes 8 to 11 (ISO/IEC 23008-12)."""
+PLUGINS = {
+    "pillow-heif": (rb"(?s).{4}ftyp(hei[cxms]|mif1|msf1)", "pillow_heif.HeifImagePlugin", "HEIF"),
+    "pillow-jxl-plugin": (rb"\xff\n|\0{3}\x0cJXL ", "pillow_jxl", "JPEG XL"),
+}
+"""Plug-ins of Pillow: first bytes of their format (ISO/IEC 23008-12, 18181-2), the module that
+registers it at its import, and its name."""
+
+VIDEO = (
+    rb"(?s)\x1aE\xdf\xa3|.{8}AVI |0&\xb2u|FLV|OggS|\0\0\x01[\xb3\xba]|\0\0\0\x01|\x06\x0e\+4"
+    rb"|\x1f\x07\0|DKIF|YUV4MPEG2|.{4}(ftyp|moov|mdat|wide|skip|free)|G.{187}G|.{4}G.{191}G"
+)
+"""First bytes of Matroska, AVI, WMV, FLV, Ogg, MPEG-1 and 2, H.264 and H.265, MXF, DV, IVF,
+YUV4MPEG, MP4 and MOV, and of MPEG transport streams, whose packets have 188 or 192 bytes."""
 
 
 @suggest_keywords
@@ -299,8 +313,8 @@ def _check_png(file: BinaryIO, name: str) -> None:
     file.seek(0)
 
 
-def identify(file: BinaryIO, name: str) -> Any:
-    """Open a file with the first format of `FORMATS` that accepts it.
+def identify(file: BinaryIO, name: str, formats: Iterable[str] = FORMATS) -> Any:
+    """Open a file with the first of the formats, which are keys of `FORMATS`, that accepts it.
 
     `PIL.Image.open` is not used, because its size limit can only be set for the whole program.
     """
@@ -310,21 +324,19 @@ def identify(file: BinaryIO, name: str) -> Any:
     Image.init()  # registers all formats; not every build of Pillow has AVIF
     file.seek(0)
     start = file.read(SIGNATURE_BYTES)
-    heif = start[4:8] == b"ftyp" and start[8:12] in HEIF_BRANDS
-    if heif:
+    plugin = next((key for key, (begins, *_) in PLUGINS.items() if re.match(begins, start)), None)
+    if plugin:
         with suppress(ModuleNotFoundError):
-            from pillow_heif import register_heif_opener
-
-            register_heif_opener()
+            importlib.import_module(PLUGINS[plugin][1])
     for beginning, (what, _) in UNREAD.items():
-        if beginning in (start[: len(beginning)], start[128:]):
+        if beginning in (start[: len(beginning)], start[128:132]):
             raise ImageError(
                 f"{name} is {what}, which has no defined value range: load it with another "
                 "program, and give an array or a PNG file"
             )
     if name.lower().endswith(RAW_SUFFIXES):
         return develop(file, name)
-    for key in FORMATS:
+    for key in formats:
         if key not in Image.OPEN:
             continue
         factory, accept = Image.OPEN[key]
@@ -333,10 +345,18 @@ def identify(file: BinaryIO, name: str) -> Any:
             if accepted and not isinstance(accepted, str):  # a string names a missing library
                 file.seek(0)
                 return factory(file, "")
-        except (SyntaxError, IndexError, TypeError, struct.error):
-            continue
-    if heif:
-        raise MissingExtraError(f"{name} is a HEIF image: run pip install pillow-heif to read it")
+        except (SyntaxError, IndexError, TypeError, struct.error) as error:
+            if key == "JPEG" and "-bit" in str(error):
+                text = f"{name} is a JPEG image that Pillow does not read ({error})"
+                raise ImageError(f"{text}: give the array that imagecodecs reads") from None
+    if plugin:
+        kind = PLUGINS[plugin][2]
+        raise MissingExtraError(f"{name} is a {kind} image: run pip install {plugin} to read it")
+    if re.match(VIDEO, start):
+        raise ImageError(
+            f'{name} is a video: take frames from it, such as by ffmpeg -i "{name}" -vf fps=5 '
+            "frames/%05d.jpg (docs/reconstruction.md), and give these"
+        )
     raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from .._shared.errors import ImageError, MissingExtraError
 from .._shared.image_array import array_to_rgb
-from .image_file import ReadingOptions, damaged_image, develop, identify
+from .image_file import ReadingOptions, damaged_image, develop, identify, open_file
 
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
@@ -89,15 +89,40 @@ def read_tiff(
 
 def chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
     """Return the page that the options choose, or the largest; skip thumbnails and masks."""
-    pages = [page for page in stored if not (page.is_reduced or page.is_mask)]
-    if not pages:
-        below = [each for page in stored for each in page.pages or ()]
-        pages = [page for page in below if not (page.is_reduced or page.is_mask)] or stored[:1]
+    pages = whole_pages(stored)
     if options.page is None:
         return max(pages, key=lambda page: page.imagewidth * page.imagelength)
     if options.page >= len(pages):
         raise ImageError(f"{name} has {len(pages)} pages: give a `page` below that")
     return pages[options.page]
+
+
+def whole_pages(stored: list[Any]) -> list[Any]:
+    """Return the pages, or else those below them, that are neither thumbnails nor masks."""
+    pages = [page for page in stored if not (page.is_reduced or page.is_mask)]
+    below = [each for page in stored for each in page.pages or ()] if not pages else []
+    return pages or [each for each in below if not (each.is_reduced or each.is_mask)] or stored[:1]
+
+
+def page_numbers(source: Any) -> list[int]:
+    """Return the numbers, from 0, of the images in a file: values of `page` in `load_image`.
+
+    Images at most half as wide or high as the largest do not count: previews, gain maps, and the
+    levels of a pyramid.
+    """
+    from tifffile import TiffFile
+
+    with open_file(source) as (file, name):
+        if file.read(4) in TIFF_STARTS:
+            file.seek(0)
+            with TiffFile(file, name="image.tif") as tiff:
+                sizes = [(each.imagewidth, each.imagelength) for each in whole_pages([*tiff.pages])]
+        else:
+            with identify(file, name) as image:
+                count = 1 if image.format == "PSD" else getattr(image, "n_frames", 1)  # layers
+                sizes = [image.seek(k) or image.size for k in range(count)]
+    width, height = np.max(sizes, axis=0)
+    return [k for k, (w, h) in enumerate(sizes) if 2 * w > width and 2 * h > height]
 
 
 def _checked_kind(page: Any, name: str) -> int:

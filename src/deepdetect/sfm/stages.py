@@ -35,7 +35,7 @@ from ..features.keypoints import Keypoints
 from ..features.match_filter import suits_filter
 from ..features.selection import SelectionOptions
 from ..geometry.camera import PosedView
-from ..io.image import find_images, name_images
+from ..io.image import find_images, load_image, name_images
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .depth_maps import MATCHED_NEIGHBOURS, depth_map, find_references, limited_view
@@ -148,6 +148,7 @@ def check_images(
         if not path.is_file():
             raise MissingImageError(f"there is no file {path}: check the path")
         if path.suffix.lower() not in IMAGE_SUFFIXES:
+            load_image(path)  # fails for a video, with advice
             raise OptionError(f"{path} does not end in .jpg, .png or another image type: rename it")
     return name_images(paths)
 

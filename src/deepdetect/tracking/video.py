@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..io.image import find_images, load_image
 from ..io.image_file import IMAGE_SUFFIXES
+from ..io.tiff import page_numbers
 
 FOLDER_FPS = 10.0
 """This rate, in frames per second, is assumed for folders and for videos that state no rate."""
@@ -31,6 +33,9 @@ FOLDER_FPS = 10.0
 MAX_FPS = 1000.0
 """If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
+FIRST_FRAMES = 25
+"""This many frames are compared: if all are equal, so are some of their packets, since counters in
+the headers of H.264 start again after 16 frames, and MPEG's groups of pictures after 12 to 15."""
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 
@@ -49,12 +54,13 @@ class Frame:
 
 
 class FrameSource(AbstractContextManager["FrameSource"]):
-    """The frames of a video file, of the images below a folder, or of a camera.
+    """The frames of a video file, of the images below a folder or in a file, or of a camera.
 
     Iterate over it once, in a `with` block.
 
     Args:
-        source: a file, a folder (images in the order of their names), or the number of a camera.
+        source: a video, an image file of several pages or frames, such as TIFF or GIF, a folder
+            (images in the order of their names), or the number of a camera.
         every: process every N-th frame.
         max_frames: largest number of frames that are taken; None: all.
 
@@ -67,7 +73,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
     Raises:
         MissingFileError: there is no such file, folder or camera.
         ImageError: the folder holds no image.
-        InvalidFileError: the file is not a video that can be read.
+        InvalidFileError: the file is not a video that can be read, or OpenCV does not decode it.
         OptionError: an option is out of its range.
     """
 
@@ -80,26 +86,28 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         self.camera = _camera_number(source)
         self.live = self.camera is not None
         self._capture: Any = None
-        self._images: list[Path] = []
+        self._images: list[tuple[Path, int | None]] = []
         self.failures: list[str] = []
-        path, fps = Path(str(source)), FOLDER_FPS
+        self.path = path = Path(str(source))
+        fps, total = FOLDER_FPS, 0
         if not self.live and path.is_dir():
-            self._images = find_images(path)
-            total = len(self._images)
+            self._images = [(each, None) for each in find_images(path)]
+        elif not self.live and path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
+            self._images = [(path, page) for page in page_numbers(path)]
+            if len(self._images) == 1:
+                raise ImageError(f"{path} is a single image: give a video, or a folder of frames")
         else:
             self._capture = self._opened(path)
             stated = float(self._capture.get(cv2.CAP_PROP_FPS))
             fps = stated if 0 < stated <= MAX_FPS else fps
             total = 0 if self.live else int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.fps = fps / every
-        taken = -(-max(0, total) // every)
+        taken = -(-max(0, len(self._images) or total) // every)
         self.count = min((number for number in (taken, max_frames) if number), default=None)
 
     def _opened(self, path: Path) -> Any:
         if not self.live and not path.is_file():
             raise MissingFileError(f"there is no video, folder or camera {path}: check the path")
-        if not self.live and path.suffix.lower() in IMAGE_SUFFIXES:
-            raise ImageError(f"{path} is a single image: give a video, or a folder of frames")
         capture = cv2.VideoCapture(self.camera if self.live else str(path))
         if capture.isOpened():
             return capture
@@ -118,9 +126,9 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
     def _from_images(self) -> Iterator[Frame]:
         first: tuple[int, ...] = ()
-        for number, path in list(enumerate(self._images))[:: self.every]:
+        for number, (path, page) in list(enumerate(self._images))[:: self.every]:
             try:
-                rgb = load_image(path)
+                rgb = load_image(path, page=page)
             except ImageError as error:
                 self.failures.append(str(error))
                 continue
@@ -138,6 +146,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             raise BatchError(f"none of {count} frames can be read", self.failures)
 
     def _from_capture(self) -> Iterator[Frame]:
+        first = np.empty(0)
         for number in count():
             wanted = number % self.every == 0
             # `grab` skips a frame without decoding it, if the format allows it.
@@ -145,13 +154,39 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             if not done:
                 break
             if wanted:
-                yield Frame(number, load_image(bgr, channels="bgr"))
+                rgb = load_image(bgr, channels="bgr")
+                first = rgb if number == 0 else first
+                if number == self.every and not self.live and np.array_equal(rgb, first):
+                    _check_decoded(self.path)
+                yield Frame(number, rgb)
         if not number:
             raise DeepDetectError("the source has no frames: check it with another program")
 
     def __exit__(self, *_: object) -> None:
         if self._capture is not None:
             self._capture.release()
+
+
+def _check_decoded(path: Path) -> None:
+    """Warn if the first frames of a video are all equal; raise an error if they should not be.
+
+    The conversion of interlaced frames fails in OpenCV 4.14 and 5.0, which then return what was in
+    the memory before. If the frames of a video are equal, so are some of its packets.
+    """
+    raw = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    packets, frames = (
+        [hash(capture.retrieve()[1].tobytes()) for _ in range(FIRST_FRAMES) if capture.grab()]
+        for capture in (raw, cv2.VideoCapture(str(path)))
+    )
+    if len({*frames}) > 1:
+        return
+    text = f"the first {len(frames)} frames of {path} are equal"
+    if packets and len({*packets}) == len(packets):
+        raise InvalidFileError(
+            f"{text}, but should not be, as where the installed OpenCV fails with interlaced "
+            f'videos: convert it, such as by ffmpeg -i "{path}" -vf yadif progressive.mp4'
+        )
+    warnings.warn(f"{text}: check that nothing moves in them", UserWarning, stacklevel=2)
 
 
 def _camera_number(source: str | Path | int) -> int | None:

@@ -1,0 +1,54 @@
+"""Files in folders of images that are no further images: masks, and unknown suffixes."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from .image_file import FORMATS, identify
+
+MASK_WORD = re.compile(r"^masks?([ ._-]+|$)|[ ._-]+masks?(?=[ ._-]|$)", re.IGNORECASE)
+"""This word is what distinguishes the name of a mask, or of a folder of masks."""
+
+
+def holds_image(path: Path) -> bool:
+    """Return whether a file of any suffix begins like an image that can be opened."""
+    with suppress(Exception), path.open("rb") as file:  # Pillow's readers raise many kinds
+        return identify(file, "", [key for key in FORMATS if key != "TGA"]) is not None
+    return False
+
+
+def without_masks(paths: Iterable[Path]) -> list[Path]:
+    """Return the image files without those that are named as masks of others; warn about these.
+
+    Masks of NAME.jpg are NAME_mask.png, NAME.mask.png, mask_NAME.png and NAME.jpg.png in its
+    folder, and these and NAME.png below a folder `masks`.
+    """
+    paths = [*paths]
+    folders = {path.parent for path in paths}
+    shared = set.intersection(*({*folder.parts} for folder in folders or {Path()}))
+    marked = {each for each in folders if any(map(MASK_WORD.search, {*each.parts} - shared))}
+    stems = {(path.parent, path.stem.casefold()) for path in paths}
+    names = {(path.parent, path.name.casefold()) for path in paths if path.suffix}
+    photographs = {name for folder, name in stems | names if folder not in marked}
+
+    def is_mask(path: Path) -> bool:
+        name = MASK_WORD.sub("", path.stem).casefold()
+        own, changed = (path.parent, name), name != path.stem.casefold()
+        beside = own in names or (changed and own in stems)
+        return beside or (path.parent in marked and name in photographs)
+
+    masks = dict.fromkeys(filter(is_mask, paths))
+    tell_left_out([*masks], "files named as masks of other images")
+    return [path for path in paths if path not in masks]
+
+
+def tell_left_out(paths: Sequence[Path], what: str) -> None:
+    """Warn that files are left out."""
+    if paths:
+        first = Path(*paths[0].parts[-2:])  # the same sentence for an absolute path
+        text = f"{len(paths)} {what} are left out, such as {first} (rename them to use them)"
+        warnings.warn(text, UserWarning, stacklevel=4)
