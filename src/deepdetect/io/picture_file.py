@@ -29,6 +29,11 @@ from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
 """Tags of GeoTIFF for pixel scale and transformation. A georeferenced TIFF has one of them."""
 
+NO_MATRIX = "the place of an image is not kept, since no affine matrix that GDAL reads states it: \
+warp an image with ground control points or RPCs by gdalwarp first"
+NO_SYSTEM = "a GeoTIFF without a coordinate system keeps its place as that of a local grid: assign \
+the system by gdal_edit.py -a_srs if you know it"
+
 FIRST_CENTRE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 """This matrix maps the package's pixel coordinates, whose origin is the centre of the first pixel,
 to GDAL's, whose origin is the top left corner of that pixel."""
@@ -250,33 +255,22 @@ def _read_place(path: Path, page: Any, orientation: int) -> dict[str, Any]:
             if file.crs is None and ".prj" in beside:
                 text = beside[".prj"].read_text("utf-8")
                 place["crs"] = rasterio.CRS.from_user_input(text)
-    if stated and "to_world" not in place:
-        warnings.warn(
-            "the place of an image is not kept, since no affine matrix that GDAL reads states it: "
-            "warp an image with ground control points or RPCs by gdalwarp first",
-            UserWarning,
-            stacklevel=2,
-        )
-    # GDAL may name a system that is nowhere on the Earth, which it makes up.
-    elif tagged and not (place["crs"] and (place["crs"].is_geographic or place["crs"].is_projected)):
-        warnings.warn(
-            "a GeoTIFF without a coordinate system keeps its place as that of a local grid: assign "
-            "the system by gdal_edit.py -a_srs if you know it",
-            UserWarning,
-            stacklevel=2,
-        )
+    problem, crs = "", place.get("crs")
+    if "to_world" not in place:
+        problem = NO_MATRIX if stated else ""
+    elif tagged and not (crs and (crs.is_geographic or crs.is_projected)):
+        problem = NO_SYSTEM
+    if problem:
+        warnings.warn(problem, UserWarning, stacklevel=2)
     return place
 
 
 def _stored_pixels(orientation: int, width: int, height: int) -> np.ndarray:
     """Return the (3, 3) matrix from pixels of the upright image to those of the stored one."""
-    x, y = np.meshgrid([0.0, width - 1], [0.0, height - 1])
-    corners = np.dstack([x, y])
-    corners = UPRIGHT.get(orientation, np.asarray)(corners)
-    first, right, down = corners[0, 0], corners[0, 1], corners[1, 0]
-    matrix = np.eye(3)
-    matrix[:2] = np.column_stack([np.sign(right - first), np.sign(down - first), first])
-    return matrix
+    stored = np.dstack(np.meshgrid([0.0, width - 1], [0.0, height - 1]))
+    (first, right), (down, _) = UPRIGHT.get(orientation, np.asarray)(stored)
+    axes = np.sign([right - first, down - first])
+    return np.vstack([np.column_stack([*axes, first]), [0, 0, 1]])
 
 
 @contextmanager

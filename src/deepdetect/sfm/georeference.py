@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, ReconstructionError, first_line, require_packages
+from .._shared.errors import NoPlaceError, OptionError, ReconstructionError
 from ..geometry.camera import PosedView
-from ..geometry.similarity import Similarity, SimilarityFit, fit_similarity
-from ..io.gps import read_gps
+from ..geometry.similarity import (
+    MUCH_BETTER,
+    WRONG_STDS,
+    Similarity,
+    SimilarityFit,
+    fit_similarity,
+)
+from ..io.gps import ELLIPSOID, TAKE_OFF, GpsFix, read_gps
 from ..io.image import find_images
 from .colmap import import_pycolmap
+from .control_points import ControlRow, read_control_points
 from .mapping import SparseModel
+
+__all__ = ["ControlRow", "Georeference", "Origin", "georeference", "read_control_points"]
 
 GPS_ACCURACY_M = 3.0
 """Assumed accuracy of GPS positions that state none. Usual receivers reach it in the open."""
@@ -53,6 +64,11 @@ weight times the mean optical axis, because cameras look down more often than up
 MAX_DISTANCE_PX = 15.0
 """A pixel that the user gives as the end of a known distance stands for a point of the model that
 projects to within this distance of the pixel. Chosen by hand."""
+
+DISAGREE = "the ground control points do not agree with the model"
+
+UNITS = {"feet": 0.3048, "metres": 1 / 0.3048}
+"""Heights that are in this unit, but were taken for the other one, become right times this."""
 
 NEARLY_A_LINE = "the positions lie nearly on a line: the rotation of the model about this line \
 follows from the assumption that the cameras are held upright"
@@ -99,6 +115,8 @@ class Georeference:
             name of the image (GPS) or of the control point.
         wrong: images or control points that were left out, because they contradict the others.
         fit: the fitted similarity with its uncertainty; None for a known distance.
+        heights: what heights are measured from, such as "above the sea level"; nobody converts
+            them.
     """
 
     similarity: Similarity
@@ -107,6 +125,7 @@ class Georeference:
     residuals: Mapping[str, np.ndarray] = field(default_factory=dict)
     wrong: tuple[str, ...] = ()
     fit: SimilarityFit | None = None
+    heights: str = "unknown"
 
     def summary(self) -> dict[str, Any]:
         """Return the values as plain Python types for JSON."""
@@ -118,7 +137,11 @@ class Georeference:
         return {
             "source": self.source,
             "axes": "metres east, north and up of the origin",
-            "origin": vars(self.origin) | {"crs": "EPSG:4979"},
+            "origin": {
+                **vars(self.origin),
+                "crs": "EPSG:4979" if self.heights == ELLIPSOID else "EPSG:4326",
+                "height_is": self.heights,
+            },
             "utm_crs": f"EPSG:{self.origin.to_utm(np.zeros((1, 3)))[1]}",
             "used": len(good),
             "wrong": list(self.wrong),
@@ -154,7 +177,7 @@ def georeference(
 
     Raises:
         OptionError: an end of the distance is not in the model, or it has too few control points.
-        ReconstructionError: the control points contradict the model.
+        NoPlaceError: the control points contradict the model.
     """
     scale = None
     if scale_by is not None:
@@ -207,12 +230,37 @@ def georeference_by_gps(
         raise ReconstructionError(
             f"{len(fixes)} of the images have GPS, but {MIN_FIXES} are needed"
         )
-    places = np.array([(fix.latitude, fix.longitude, fix.altitude) for fix in fixes.values()])
+    if assumed := [name for name, fix in fixes.items() if fix.assumed_hemisphere]:
+        warnings.warn(
+            f"the GPS positions of {len(assumed)} images, such as {assumed[0]}, do not say north "
+            "or south, or not east or west: north and east are assumed",
+            UserWarning,
+            stacklevel=2,
+        )
+    reference, altitudes = _altitudes([*fixes.values()])
+    places = np.array([(fix.latitude, fix.longitude) for fix in fixes.values()])
+    places = np.column_stack([places, altitudes])
     stated = [fix.accuracy_m for fix in fixes.values() if fix.accuracy_m is not None]
     accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M
     up, level, stds = upright(views, {name: fix.gravity for name, fix in fixes.items()})
     centres = {name: views[name].centre for name in fixes}
-    return _place("GPS", centres, places, accuracy, scale, up=up, level=level, level_stds=stds)
+    known = {"up": up, "level": level, "level_stds": stds}
+    return _place("GPS", centres, places, accuracy, scale, reference, **known)
+
+
+def _altitudes(fixes: Sequence[GpsFix]) -> tuple[str, np.ndarray]:
+    """Return what most altitudes are measured from, and (N,) of them; NaN for all others.
+
+    Those above the take-off point, which may be another one for each flight, count only if all
+    images have one.
+    """
+    above = np.array([fix.above_take_off for fix in fixes])
+    known = {TAKE_OFF: np.full(len(fixes), np.nan) if np.isnan(above).any() else above}
+    for name in {fix.reference for fix in fixes}:
+        known[name] = np.array([f.altitude if f.reference == name else np.nan for f in fixes])
+    count = {name: int(np.isfinite(values).sum()) for name, values in known.items()}
+    best = max(sorted(known), key=lambda name: (count[name], name != TAKE_OFF))
+    return best, known[best]
 
 
 def _place(
@@ -221,6 +269,8 @@ def _place(
     places: np.ndarray,
     accuracy: float,
     scale: float | None,
+    heights: str,
+    stds: np.ndarray | None = None,
     **upright: Any,
 ) -> Georeference:
     unknown = np.isnan(places[:, 2])
@@ -229,23 +279,58 @@ def _place(
     origin = Origin(round(latitude, 6), round(longitude, 6), round(height, 1))
     targets = origin.to_enu(places)
     targets[unknown, 2] = np.nan
-    problem = ReconstructionError(
-        "the GPS positions contradict each other, or lie too close together for their accuracy"
-        if source == "GPS"
-        else "the ground control points do not agree with the model: check their coordinates, "
-        "pixels and image names"
-    )
-    try:
-        fit = fit_similarity(
-            np.array([*points.values()]), targets, accuracy, scale=scale, **upright
+    problem = (
+        ReconstructionError(
+            "the GPS positions contradict each other, or lie too close together for their accuracy"
         )
+        if source == "GPS"
+        else NoPlaceError(f"{DISAGREE}: check their coordinates, pixels and image names")
+    )
+    own = np.array([*points.values()])
+    known = {"accuracy": accuracy, "scale": scale, **upright}
+    try:
+        fit = fit_similarity(own, targets, **known)
     except ReconstructionError:
         raise problem from None
     if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
         raise problem
+    if stds is not None:
+        _check_residuals(fit, [*points], own, targets, stds, known)
     residuals = dict(zip(points, fit.residuals, strict=True))
     wrong = tuple(name for name, is_wrong in zip(points, fit.wrong, strict=True) if is_wrong)
-    return Georeference(fit.similarity, source, origin, residuals, wrong, fit)
+    heights = "unknown" if unknown.all() else heights
+    return Georeference(fit.similarity, source, origin, residuals, wrong, fit, heights)
+
+
+def _check_residuals(
+    fit: SimilarityFit,
+    names: Sequence[str],
+    points: np.ndarray,
+    targets: np.ndarray,
+    stds: np.ndarray,
+    known: Mapping[str, Any],
+) -> None:
+    """Raise a NoPlaceError if residuals exceed both accuracies, and no bent model explains them.
+
+    The accuracies are those of the targets, and of the points in the model (`stds`). A bent model
+    has residuals far below the extent of its points, and another unit of heights is no remedy.
+    """
+    away = np.linalg.norm(np.nan_to_num(fit.residuals), axis=1)
+    expected = np.hypot(known["accuracy"], fit.similarity.scale * stds)
+    if np.median((away / expected)[~fit.wrong]) < WRONG_STDS:
+        return
+    median = np.median(away[~fit.wrong])
+    bent = median < MAX_SCALE_STD * np.linalg.norm(np.nanstd(targets, axis=0))
+    likely = "" if bent else "the unit of the heights, the order of the columns, the coordinate "
+    likely += "" if bent else "system, and the names of the images"
+    for unit, factor in UNITS.items():
+        with suppress(ReconstructionError):
+            other = fit_similarity(points, targets * [1, 1, factor], **known).residuals
+            if np.median(np.linalg.norm(np.nan_to_num(other), axis=1)) < MUCH_BETTER * median:
+                likely = f"whether the heights are in {unit}, which fits far better"
+    if likely:
+        worst = ", ".join(f"{names[k]} by {away[k]:.3g} m" for k in np.argsort(-away)[:MIN_FIXES])
+        raise NoPlaceError(f"{DISAGREE} (the worst are {worst}): check {likely}")
 
 
 def upright(
@@ -276,59 +361,17 @@ def upright(
     return up / np.linalg.norm(up), np.array(level), np.radians(stds)
 
 
-class ControlRow(NamedTuple):
-    """A ground control point in an image. `place` is its latitude, longitude and height."""
-
-    name: str
-    place: tuple[float, float, float]
-    image: str
-    xy: np.ndarray
-
-
-def read_control_points(path: str | Path) -> list[ControlRow]:
-    """Read a file of ground control points in the format of OpenDroneMap.
-
-    The first line names the coordinate system, such as "EPSG:32633" or "WGS84 UTM 33N". Each other
-    line is `x y z column row image [name]`: a point's coordinates, its pixel in an image, the name
-    of the image, and perhaps that of the point.
-    """
-    require_packages("a file of ground control points", "pyproj")
-    from pyproj import CRS, Transformer
-
-    try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-        system, *lines = [line.strip() for line in lines if line.strip() and line[0] != "#"]
-        if zone := re.fullmatch(r"WGS84 UTM (\d+)([NS])", system):
-            system = f"EPSG:{(32600 if zone[2] == 'N' else 32700) + int(zone[1])}"
-        to_degrees = Transformer.from_crs(CRS.from_user_input(system), 4326, always_xy=True)
-        rows = []
-        for line in lines:
-            x, y, z, column, row, image, *name = line.split()
-            longitude, latitude = to_degrees.transform(float(x), float(y))
-            xy = np.array([float(column), float(row)])
-            place = latitude, longitude, float(z)
-            rows.append(ControlRow((name or [f"{x} {y} {z}"])[0], place, image, xy))
-    except OSError as error:
-        raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # an error of pyproj, or text in place of numbers
-        raise OptionError(
-            f"{path} is not a file of ground control points ({first_line(error)}): the first line "
-            "must be the coordinate system, such as EPSG:32633, and each other line 'x y z column "
-            "row image'"
-        ) from None
-    return rows
-
-
 def georeference_by_control_points(
     sparse: SparseModel, control: Sequence[ControlRow], scale: float | None = None
 ) -> Georeference:
     """Find the place of a model by the control points marked in two or more of its images."""
     seen = _seen_by_several(control, _by_file_name(sparse.images))
-    points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
-    places = np.array([next(iter(rows.values())).place for rows in seen.values()])
-    up, level, stds = upright(sparse.views)
-    known = {"up": up, "level": level, "level_stds": stds}
-    return _place("ground control points", points, places, CONTROL_ACCURACY_M, scale, **known)
+    rows = [next(iter(each.values())) for each in seen.values()]
+    found, stds = zip(*(_triangulated(sparse, each) for each in seen.values()), strict=True)
+    points, places = dict(zip(seen, found, strict=True)), np.array([row.place for row in rows])
+    up, level, level_stds = upright(sparse.views)
+    what = "ground control points", points, places, CONTROL_ACCURACY_M, scale, rows[0].heights
+    return _place(*what, np.array(stds), up=up, level=level, level_stds=level_stds)
 
 
 def _seen_by_several(
@@ -341,7 +384,10 @@ def _seen_by_several(
     seen: dict[str, dict[str, ControlRow]] = {}
     for row in control:
         if row.image in names:
-            seen.setdefault(row.name, {})[names[row.image]] = row
+            rows = seen.setdefault(row.name, {})
+            rows[names[row.image]] = row
+            if not np.array_equal(row.place, next(iter(rows.values())).place, equal_nan=True):
+                raise NoPlaceError(f"the control point {row.name} has two places: name it twice")
     seen = {name: rows for name, rows in seen.items() if len(rows) > 1}
     if len(seen) < MIN_FIXES:
         raise OptionError(
@@ -360,8 +406,11 @@ def _by_file_name(names: Iterable[str]) -> dict[str, str]:
     return {**alone, **{name: name for name in names}}
 
 
-def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.ndarray:
-    """Return the point (3,) that is nearest to the lines of sight of a control point's pixels."""
+def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> tuple[np.ndarray, float]:
+    """Return the point (3,) that is nearest to the lines of sight of a control point's pixels.
+
+    Also returns its standard deviation, if its pixels are as accurate as those of sparse points.
+    """
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for name, row in rows.items():
         view = sparse.images[name].view
@@ -370,7 +419,11 @@ def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.nda
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         normal += across
         right += across @ view.centre
-    return np.linalg.solve(normal, right)
+    point = np.linalg.solve(normal, right)
+    views = [sparse.images[name].view for name in rows]
+    pixel = np.mean([np.linalg.norm(point - v.centre) / v.camera.focal_px[0] for v in views])
+    error = pixel * float(np.median(sparse.errors)) * np.sqrt(np.trace(np.linalg.inv(normal)))
+    return point, float(error)
 
 
 def scale_by_distance(
