@@ -22,7 +22,7 @@ from ..geometry.similarity import (
     SimilarityFit,
     fit_similarity,
 )
-from ..io.gps import ELLIPSOID, TAKE_OFF, GpsFix, read_gps
+from ..io.gps import ELLIPSOID, SEA_LEVEL, TAKE_OFF, GpsFix, read_gps
 from ..io.image import find_images
 from .colmap import import_pycolmap
 from .control_points import ControlRow, read_control_points
@@ -65,10 +65,18 @@ MAX_DISTANCE_PX = 15.0
 """A pixel that the user gives as the end of a known distance stands for a point of the model that
 projects to within this distance of the pixel. Chosen by hand."""
 
-DISAGREE = "the ground control points do not agree with the model"
+MAX_BEND = 0.05
+"""A bent model has residuals of up to this share of the extent of its points; a mistake in the
+control points mostly makes larger ones. Chosen by hand."""
 
-UNITS = {"feet": 0.3048, "metres": 1 / 0.3048}
-"""Heights that are in this unit, but were taken for the other one, become right times this."""
+READINGS = {
+    "heights are in feet": np.diag([1, 1, 0.3048]),
+    "heights are in metres": np.diag([1, 1, 1 / 0.3048]),
+    "x and y are exchanged": np.eye(3)[[1, 0, 2]],
+}
+"""Mistakes that leave coordinates plausible, and what corrects metres east, north and up."""
+
+CAUSES = "the units, the order of the columns, the coordinate system, and the names of the images"
 
 NEARLY_A_LINE = "the positions lie nearly on a line: the rotation of the model about this line \
 follows from the assumption that the cameras are held upright"
@@ -115,8 +123,7 @@ class Georeference:
             name of the image (GPS) or of the control point.
         wrong: images or control points that were left out, because they contradict the others.
         fit: the fitted similarity with its uncertainty; None for a known distance.
-        heights: what heights are measured from, such as "above the sea level"; nobody converts
-            them.
+        heights: what heights are measured from, such as "above sea level"; none are converted.
     """
 
     similarity: Similarity
@@ -134,14 +141,11 @@ class Georeference:
         good = np.array([r for name, r in self.residuals.items() if name not in self.wrong])
         up = np.abs(good[:, 2])[np.isfinite(good[:, 2])]
         alone = round(self.fit.axis_std_deg_of_targets, 2)
+        crs = "EPSG:4979" if self.heights == ELLIPSOID else "EPSG:4326"
         return {
             "source": self.source,
             "axes": "metres east, north and up of the origin",
-            "origin": {
-                **vars(self.origin),
-                "crs": "EPSG:4979" if self.heights == ELLIPSOID else "EPSG:4326",
-                "height_is": self.heights,
-            },
+            "origin": vars(self.origin) | {"crs": crs, "height_is": self.heights},
             "utm_crs": f"EPSG:{self.origin.to_utm(np.zeros((1, 3)))[1]}",
             "used": len(good),
             "wrong": list(self.wrong),
@@ -231,36 +235,32 @@ def georeference_by_gps(
             f"{len(fixes)} of the images have GPS, but {MIN_FIXES} are needed"
         )
     if assumed := [name for name, fix in fixes.items() if fix.assumed_hemisphere]:
-        warnings.warn(
-            f"the GPS positions of {len(assumed)} images, such as {assumed[0]}, do not say north "
-            "or south, or not east or west: north and east are assumed",
-            UserWarning,
-            stacklevel=2,
-        )
-    reference, altitudes = _altitudes([*fixes.values()])
+        what = f"the GPS of {len(assumed)} images, such as {assumed[0]}, lacks N or S, or E or W"
+        warnings.warn(f"{what}: north and east are assumed", UserWarning, stacklevel=2)
+    heights, altitudes = _altitudes([*fixes.values()])
     places = np.array([(fix.latitude, fix.longitude) for fix in fixes.values()])
     places = np.column_stack([places, altitudes])
     stated = [fix.accuracy_m for fix in fixes.values() if fix.accuracy_m is not None]
     accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M
     up, level, stds = upright(views, {name: fix.gravity for name, fix in fixes.items()})
     centres = {name: views[name].centre for name in fixes}
-    known = {"up": up, "level": level, "level_stds": stds}
-    return _place("GPS", centres, places, accuracy, scale, reference, **known)
+    known = {"scale": scale, "up": up, "level": level, "level_stds": stds}
+    return _place("GPS", centres, places, accuracy, heights, **known)
 
 
 def _altitudes(fixes: Sequence[GpsFix]) -> tuple[str, np.ndarray]:
-    """Return what most altitudes are measured from, and (N,) of them; NaN for all others.
+    """Return what most altitudes (N,) are measured from, and these; NaN for all others.
 
-    Those above the take-off point, which may be another one for each flight, count only if all
-    images have one.
+    Each flight may have its own take-off point, so heights above it count only if all have one.
     """
+    table = {name: np.full(len(fixes), np.nan) for name in (TAKE_OFF, SEA_LEVEL, ELLIPSOID)}
+    for k, fix in enumerate(fixes):
+        table[fix.reference][k] = fix.altitude
     above = np.array([fix.above_take_off for fix in fixes])
-    known = {TAKE_OFF: np.full(len(fixes), np.nan) if np.isnan(above).any() else above}
-    for name in {fix.reference for fix in fixes}:
-        known[name] = np.array([f.altitude if f.reference == name else np.nan for f in fixes])
-    count = {name: int(np.isfinite(values).sum()) for name, values in known.items()}
-    best = max(sorted(known), key=lambda name: (count[name], name != TAKE_OFF))
-    return best, known[best]
+    if not np.isnan(above).any():
+        table[TAKE_OFF] = above
+    best = max(reversed(table), key=lambda name: np.isfinite(table[name]).sum())
+    return best, table[best]
 
 
 def _place(
@@ -268,10 +268,9 @@ def _place(
     points: Mapping[str, np.ndarray],
     places: np.ndarray,
     accuracy: float,
-    scale: float | None,
     heights: str,
     stds: np.ndarray | None = None,
-    **upright: Any,
+    **known: Any,
 ) -> Georeference:
     unknown = np.isnan(places[:, 2])
     places = np.where(np.isnan(places), 0 if unknown.all() else np.nanmedian(places[:, 2]), places)
@@ -279,58 +278,58 @@ def _place(
     origin = Origin(round(latitude, 6), round(longitude, 6), round(height, 1))
     targets = origin.to_enu(places)
     targets[unknown, 2] = np.nan
-    problem = (
-        ReconstructionError(
+    own = np.array([*points.values()])
+    known["accuracy"], fit = accuracy, None
+    with suppress(ReconstructionError):
+        fit = fit_similarity(own, targets, **known)
+        if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
+            fit = None
+    if stds is not None:
+        _check_control_points(fit, [*points], own, targets, stds, known)
+    if fit is None:
+        raise ReconstructionError(
             "the GPS positions contradict each other, or lie too close together for their accuracy"
         )
-        if source == "GPS"
-        else NoPlaceError(f"{DISAGREE}: check their coordinates, pixels and image names")
-    )
-    own = np.array([*points.values()])
-    known = {"accuracy": accuracy, "scale": scale, **upright}
-    try:
-        fit = fit_similarity(own, targets, **known)
-    except ReconstructionError:
-        raise problem from None
-    if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
-        raise problem
-    if stds is not None:
-        _check_residuals(fit, [*points], own, targets, stds, known)
     residuals = dict(zip(points, fit.residuals, strict=True))
     wrong = tuple(name for name, is_wrong in zip(points, fit.wrong, strict=True) if is_wrong)
     heights = "unknown" if unknown.all() else heights
     return Georeference(fit.similarity, source, origin, residuals, wrong, fit, heights)
 
 
-def _check_residuals(
-    fit: SimilarityFit,
+def _check_control_points(
+    fit: SimilarityFit | None,
     names: Sequence[str],
     points: np.ndarray,
     targets: np.ndarray,
     stds: np.ndarray,
     known: Mapping[str, Any],
 ) -> None:
-    """Raise a NoPlaceError if residuals exceed both accuracies, and no bent model explains them.
+    """Raise a NoPlaceError if control points contradict a model, or fit better if read otherwise.
 
-    The accuracies are those of the targets, and of the points in the model (`stds`). A bent model
-    has residuals far below the extent of its points, and another unit of heights is no remedy.
+    They contradict it if most residuals exceed what the accuracies of the targets and of the points
+    in the model (`stds`) explain, and also what a bent model explains.
     """
-    away = np.linalg.norm(np.nan_to_num(fit.residuals), axis=1)
-    expected = np.hypot(known["accuracy"], fit.similarity.scale * stds)
-    if np.median((away / expected)[~fit.wrong]) < WRONG_STDS:
-        return
-    median = np.median(away[~fit.wrong])
-    bent = median < MAX_SCALE_STD * np.linalg.norm(np.nanstd(targets, axis=0))
-    likely = "" if bent else "the unit of the heights, the order of the columns, the coordinate "
-    likely += "" if bent else "system, and the names of the images"
-    for unit, factor in UNITS.items():
+
+    def misfit(found: SimilarityFit, factor: float = 1) -> tuple[np.ndarray, np.ndarray, float]:
+        away = np.linalg.norm(np.nan_to_num(found.residuals), axis=1)
+        relative = away / np.hypot(known["accuracy"], found.similarity.scale * stds) / factor
+        return away, relative, float((np.minimum(relative, WRONG_STDS) ** 2).sum())
+
+    likely, worst, cost = CAUSES, "", np.inf
+    if fit is not None:
+        away, relative, cost = misfit(fit)
+        far = [f"{names[k]} by {away[k]:.3g} m" for k in np.argsort(-away)[:MIN_FIXES]]
+        worst = f", worst {', '.join(far)}"
+        bent = np.median(away) < MAX_BEND * np.nanstd(targets, axis=0).max()
+        likely = "" if bent or np.median(relative) < WRONG_STDS else CAUSES
+    for reading, matrix in READINGS.items() if cost > len(names) else ():
         with suppress(ReconstructionError):
-            other = fit_similarity(points, targets * [1, 1, factor], **known).residuals
-            if np.median(np.linalg.norm(np.nan_to_num(other), axis=1)) < MUCH_BETTER * median:
-                likely = f"whether the heights are in {unit}, which fits far better"
+            shrunk = min(abs(float(np.linalg.det(matrix))), 1)
+            other = misfit(fit_similarity(points, targets @ matrix, **known), shrunk)
+            if other[2] < MUCH_BETTER * min(cost, len(names) * WRONG_STDS**2):
+                likely = f"whether {reading}, which fits far better"
     if likely:
-        worst = ", ".join(f"{names[k]} by {away[k]:.3g} m" for k in np.argsort(-away)[:MIN_FIXES])
-        raise NoPlaceError(f"{DISAGREE} (the worst are {worst}): check {likely}")
+        raise NoPlaceError(f"the ground control points contradict the model{worst}: check {likely}")
 
 
 def upright(
@@ -370,8 +369,9 @@ def georeference_by_control_points(
     found, stds = zip(*(_triangulated(sparse, each) for each in seen.values()), strict=True)
     points, places = dict(zip(seen, found, strict=True)), np.array([row.place for row in rows])
     up, level, level_stds = upright(sparse.views)
-    what = "ground control points", points, places, CONTROL_ACCURACY_M, scale, rows[0].heights
-    return _place(*what, np.array(stds), up=up, level=level, level_stds=level_stds)
+    known = {"scale": scale, "up": up, "level": level, "level_stds": level_stds}
+    what = "ground control points", points, places, CONTROL_ACCURACY_M, rows[0].heights
+    return _place(*what, np.array(stds), **known)
 
 
 def _seen_by_several(
