@@ -138,7 +138,7 @@ def test_degrees_in_the_wrong_order_and_unknown_heights(tmp_path: Path) -> None:
     [
         ("EPSG:32633", 5400200, 500100),  # exchanged
         ("EPSG:2249", 236000, 901000),  # metres in place of feet
-        ("EPSG:32610", 500100, -5400200),
+        ("EPSG:27700", 5400200, 500100),
     ],
 )
 def test_places_far_from_those_of_the_system_are_told(

@@ -32,11 +32,9 @@ class GpsFix:
         accuracy_m: horizontal standard deviation in metres as the camera states it, or None.
         gravity: (3,) unit vector towards the ground in the camera's frame (x right, y down, z
             forward), computed from the gimbal's angles, or None.
-        reference: what `altitude` is measured from: `SEA_LEVEL`, or `ELLIPSOID` for drones with
-            RTK.
+        reference: what `altitude` is measured from: `SEA_LEVEL`, or with RTK `ELLIPSOID`.
         above_take_off: metres above the place where a drone took off; NaN if unknown.
-        assumed_hemisphere: whether the photograph does not say north or south, or not east or west;
-            north and east are then assumed.
+        assumed_hemisphere: whether north or east are assumed, because nothing states them.
     """
 
     latitude: float
@@ -73,13 +71,11 @@ def read_gps(path: Path) -> GpsFix | None:
     altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if below_sea else 1)
     # Older drones write "Longtitude".
     east = drone.get("GpsLongitude", drone.get("GpsLongtitude", np.nan))
-    north = drone.get("GpsLatitude", np.nan)
-    if np.isfinite(east) and np.isfinite(north) and (north or east):
+    north, absolute = (drone.get(name, np.nan) for name in ("GpsLatitude", "AbsoluteAltitude"))
+    if np.isfinite(east + north) and (north or east):
         latitude, longitude, assumed = north, east, False
-    reference = SEA_LEVEL
-    if np.isfinite(absolute := drone.get("AbsoluteAltitude", np.nan)):
-        altitude = absolute
-        reference = ELLIPSOID if drone.get("RtkFlag", 0) > 0 else SEA_LEVEL
+    altitude = absolute if np.isfinite(absolute) else altitude
+    rtk = np.isfinite(absolute) and drone.get("RtkFlag", 0) > 0
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
         return None
     spread = np.hypot(drone.get("RtkStdLat", np.nan), drone.get("RtkStdLon", np.nan))
@@ -90,7 +86,7 @@ def read_gps(path: Path) -> GpsFix | None:
         altitude,
         accuracy if accuracy > 0 else None,
         _gravity(drone) if orientation == 1 else None,
-        reference,
+        ELLIPSOID if rtk else SEA_LEVEL,
         drone.get("RelativeAltitude", np.nan),
         assumed,
     )

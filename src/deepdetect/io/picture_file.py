@@ -5,7 +5,6 @@ The georeference is that of a GeoTIFF or a world file, read by rasterio.
 
 from __future__ import annotations
 
-import importlib.util
 import struct
 import warnings
 from collections.abc import Iterator
@@ -234,18 +233,18 @@ def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
 def _read_place(path: Path, page: Any, orientation: int) -> dict[str, Any]:
     """Return `to_world` and `crs` of an image file, or of a page of a TIFF file, if known."""
     place: dict[str, Any] = {}
-    beside = _files_beside(path)
+    files, stem = path.absolute().parent.glob("*"), path.stem.lower()
+    beside = {each.suffix.lower(): each for each in files if each.stem.lower() == stem}
     tagged = page is not None and {PIXEL_SCALE, TRANSFORMATION} & {*page.tags.keys()}
     stated = bool(tagged or beside.keys() & {*_world_endings(path)})
     if stated:
         require_packages(f"the georeference of {path}", "rasterio")
-    elif importlib.util.find_spec("rasterio") is None:
-        return place
     name = str(path.absolute())  # GDAL may read `a:b` as DRIVER:FILE
     if page is not None and page.index:
         name = f"GTIFF_DIR:{page.index + 1}:{name}"
     # Files that GDAL cannot read have no georeference; a bad .prj file raises a ValueError.
-    with _rasterio() as rasterio, suppress(OSError, ValueError), rasterio.open(name) as file:
+    missing = OSError, ValueError, ImportError
+    with suppress(*missing), _rasterio() as rasterio, rasterio.open(name) as file:
         if file.transform.is_identity:
             stated = stated or bool(file.gcps[0] or file.rpcs)
         else:
@@ -287,14 +286,6 @@ def _world_endings(path: Path) -> list[str]:
     """Return the possible suffixes of an image's world file in lower case, the usual one first."""
     ending = path.suffix[1:].lower()
     return [f".{ending[:1]}{ending[-1:]}w", f".{ending}w", ".wld"]
-
-
-def _files_beside(path: Path) -> dict[str, Path]:
-    """Return the files that differ from an image only in their suffix, by this in lower case."""
-    with suppress(OSError):
-        stem, files = path.stem.lower(), [*path.absolute().parent.iterdir()]
-        return {each.suffix.lower(): each for each in files if each.stem.lower() == stem}
-    return {}
 
 
 def _kept_exif(exif: Any) -> Any:

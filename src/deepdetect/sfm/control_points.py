@@ -86,19 +86,18 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
     x, y, z, *xy = np.array([row[:5] for row in rows], np.float64).reshape(-1, 5).T
     flat = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
     longitude, latitude = flat.transform(x, y)
-    if not np.isfinite([longitude, *xy, z * 0 == z * 0]).all() or (np.abs(latitude) > 90).any():
-        raise ValueError(f"a point is outside of {system}")
+    known = np.isfinite([longitude, *xy]).all() and (abs(latitude) <= 90).all()
+    if not (len(rows) and known and all(row[5] for row in rows)) or np.isinf(z).any():
+        raise ValueError(f"it has no points, or one without an image, or outside of {system}")
     # Neighbouring zones are in use, too, so the place may be as far off as the area is large.
-    if len(rows) and (area := crs.area_of_use):
-        width, height = (area.east - area.west) % 360 or 360, area.north - area.south
-        east, north = (np.median(longitude) - area.west + width) % 360, np.median(latitude)
-        if east > 3 * width or abs(north - (area.north + area.south) / 2) > 1.5 * height:
-            warnings.warn(
-                f"the ground control points are far from where {crs.name} is used: check the "
-                "coordinate system, the unit, and the order of the columns",
-                UserWarning,
-                stacklevel=2,
-            )
+    area = crs.area_of_use
+    width = (area.east - area.west) % 360 or 360 if area else 360
+    aside = abs((np.median(longitude) - area.west - width / 2 + 180) % 360 - 180) if area else 0
+    above = abs(2 * np.median(latitude) - area.north - area.south) if area else 0
+    if area and (aside > 1.5 * width or above > 3 * (area.north - area.south)):
+        text = f"the ground control points are far from where {crs.name} is used: check the "
+        text += "coordinate system, the unit, and the order of the columns"
+        warnings.warn(text, UserWarning, stacklevel=2)
     across, _, *up = crs.axis_info
     unit = (up or [across])[0].unit_conversion_factor if up or crs.is_projected else 1.0
     z = -unit * z if up and up[0].direction == "down" else unit * z

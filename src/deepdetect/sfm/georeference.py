@@ -244,7 +244,7 @@ def georeference_by_gps(
     accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M
     up, level, stds = upright(views, {name: fix.gravity for name, fix in fixes.items()})
     centres = {name: views[name].centre for name in fixes}
-    known = {"scale": scale, "up": up, "level": level, "level_stds": stds}
+    known: Any = {"scale": scale, "up": up, "level": level, "level_stds": stds}
     return _place("GPS", centres, places, accuracy, heights, **known)
 
 
@@ -269,7 +269,7 @@ def _place(
     places: np.ndarray,
     accuracy: float,
     heights: str,
-    stds: np.ndarray | None = None,
+    error: float | None = None,
     **known: Any,
 ) -> Georeference:
     unknown = np.isnan(places[:, 2])
@@ -284,8 +284,8 @@ def _place(
         fit = fit_similarity(own, targets, **known)
         if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
             fit = None
-    if stds is not None:
-        _check_control_points(fit, [*points], own, targets, stds, known)
+    if error is not None:
+        _check_control_points(fit, points, targets, error, known)
     if fit is None:
         raise ReconstructionError(
             "the GPS positions contradict each other, or lie too close together for their accuracy"
@@ -298,21 +298,21 @@ def _place(
 
 def _check_control_points(
     fit: SimilarityFit | None,
-    names: Sequence[str],
-    points: np.ndarray,
+    points: Mapping[str, np.ndarray],
     targets: np.ndarray,
-    stds: np.ndarray,
+    error: float,
     known: Mapping[str, Any],
 ) -> None:
     """Raise a NoPlaceError if control points contradict a model, or fit better if read otherwise.
 
-    They contradict it if most residuals exceed what the accuracies of the targets and of the points
-    in the model (`stds`) explain, and also what a bent model explains.
+    They contradict it if most residuals exceed what the accuracy of the targets, the `error` of the
+    points in the model, and a bend of the model explain.
     """
+    own, names = np.array([*points.values()]), [*points]
 
     def misfit(found: SimilarityFit, factor: float = 1) -> tuple[np.ndarray, np.ndarray, float]:
         away = np.linalg.norm(np.nan_to_num(found.residuals), axis=1)
-        relative = away / np.hypot(known["accuracy"], found.similarity.scale * stds) / factor
+        relative = away / np.hypot(known["accuracy"], found.similarity.scale * error) / factor
         return away, relative, float((np.minimum(relative, WRONG_STDS) ** 2).sum())
 
     likely, worst, cost = CAUSES, "", np.inf
@@ -325,7 +325,7 @@ def _check_control_points(
     for reading, matrix in READINGS.items() if cost > len(names) else ():
         with suppress(ReconstructionError):
             shrunk = min(abs(float(np.linalg.det(matrix))), 1)
-            other = misfit(fit_similarity(points, targets @ matrix, **known), shrunk)
+            other = misfit(fit_similarity(own, targets @ matrix, **known), shrunk)
             if other[2] < MUCH_BETTER * min(cost, len(names) * WRONG_STDS**2):
                 likely = f"whether {reading}, which fits far better"
     if likely:
@@ -365,13 +365,16 @@ def georeference_by_control_points(
 ) -> Georeference:
     """Find the place of a model by the control points marked in two or more of its images."""
     seen = _seen_by_several(control, _by_file_name(sparse.images))
-    rows = [next(iter(each.values())) for each in seen.values()]
-    found, stds = zip(*(_triangulated(sparse, each) for each in seen.values()), strict=True)
-    points, places = dict(zip(seen, found, strict=True)), np.array([row.place for row in rows])
-    up, level, level_stds = upright(sparse.views)
-    known = {"scale": scale, "up": up, "level": level, "level_stds": level_stds}
+    points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
+    rows = [next(iter(rows.values())) for rows in seen.values()]
+    places = np.array([row.place for row in rows])
+    up, level, stds = upright(sparse.views)
+    known: Any = {"scale": scale, "up": up, "level": level, "level_stds": stds}
+    views = [(sparse.images[image].view, point) for point in seen for image in seen[point]]
+    pixels = [np.linalg.norm(points[k] - v.centre) / v.camera.focal_px[0] for v, k in views]
+    error = float(np.median(pixels) * np.median(sparse.errors))
     what = "ground control points", points, places, CONTROL_ACCURACY_M, rows[0].heights
-    return _place(*what, np.array(stds), **known)
+    return _place(*what, error, **known)
 
 
 def _seen_by_several(
@@ -406,11 +409,8 @@ def _by_file_name(names: Iterable[str]) -> dict[str, str]:
     return {**alone, **{name: name for name in names}}
 
 
-def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> tuple[np.ndarray, float]:
-    """Return the point (3,) that is nearest to the lines of sight of a control point's pixels.
-
-    Also returns its standard deviation, if its pixels are as accurate as those of sparse points.
-    """
+def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.ndarray:
+    """Return the point (3,) that is nearest to the lines of sight of a control point's pixels."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for name, row in rows.items():
         view = sparse.images[name].view
@@ -419,11 +419,7 @@ def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> tuple[
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         normal += across
         right += across @ view.centre
-    point = np.linalg.solve(normal, right)
-    views = [sparse.images[name].view for name in rows]
-    pixel = np.mean([np.linalg.norm(point - v.centre) / v.camera.focal_px[0] for v in views])
-    error = pixel * float(np.median(sparse.errors)) * np.sqrt(np.trace(np.linalg.inv(normal)))
-    return point, float(error)
+    return np.linalg.solve(normal, right)
 
 
 def scale_by_distance(
