@@ -264,6 +264,7 @@ def test_residuals_that_nothing_explains(
     shown = [(n, k, xy + random.normal(0, 0.3, 2)) for n, k, xy in shown]
     if mistake in ("feet", "metres"):
         xyz[:, 2] *= {"feet": 1 / 0.3048, "metres": 0.3048}[mistake]
+        xyz[0, 2] = np.nan  # one height is unknown
     elif mistake == "exchanged":
         shift = xyz[:, :2].mean(axis=0)
         xyz[:, :2] = (xyz[:, :2] - shift)[:, ::-1] + shift

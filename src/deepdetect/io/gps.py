@@ -66,7 +66,7 @@ def read_gps(path: Path) -> GpsFix | None:
     latitude = _degrees(tags.get(GPS.GPSLatitude), north_south == "S")
     longitude = _degrees(tags.get(GPS.GPSLongitude), east_west == "W")
     assumed = north_south not in ("N", "S") or east_west not in ("E", "W")
-    # Since EXIF 3.0, 2 and 3 are heights above and below sea level, too.
+    # EXIF 3.0 adds 2 and 3 for heights above and below sea level.
     below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01", 3, b"\x03")
     altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if below_sea else 1)
     # Older drones write "Longtitude".

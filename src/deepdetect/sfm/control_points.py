@@ -89,7 +89,7 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
     known = np.isfinite([longitude, *xy]).all() and (abs(latitude) <= 90).all()
     if not (len(rows) and known and all(row[5] for row in rows)) or np.isinf(z).any():
         raise ValueError(f"it has no points, or one without an image, or outside of {system}")
-    # Neighbouring zones are in use, too, so the place may be as far off as the area is large.
+    # Zones are used beyond their borders, so the place may be as far off as the area is large.
     area = crs.area_of_use
     width = (area.east - area.west) % 360 or 360 if area else 360
     aside = abs((np.median(longitude) - area.west - width / 2 + 180) % 360 - 180) if area else 0

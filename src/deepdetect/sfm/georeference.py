@@ -69,12 +69,13 @@ MAX_BEND = 0.05
 """A bent model has residuals of up to this share of the extent of its points; a mistake in the
 control points mostly makes larger ones. Chosen by hand."""
 
-READINGS = {
-    "heights are in feet": np.diag([1, 1, 0.3048]),
-    "heights are in metres": np.diag([1, 1, 1 / 0.3048]),
-    "x and y are exchanged": np.eye(3)[[1, 0, 2]],
+READINGS: dict[str, tuple[list[int], float]] = {
+    "heights are in feet": ([0, 1, 2], 0.3048),
+    "heights are in metres": ([0, 1, 2], 1 / 0.3048),
+    "x and y are exchanged": ([1, 0, 2], 1),
 }
-"""Mistakes that leave coordinates plausible, and what corrects metres east, north and up."""
+"""Mistakes that leave coordinates plausible: the order of the axes and the factor of the heights
+that correct each one."""
 
 CAUSES = "the units, the order of the columns, the coordinate system, and the names of the images"
 
@@ -315,18 +316,17 @@ def _check_control_points(
         relative = away / np.hypot(known["accuracy"], found.similarity.scale * error) / factor
         return away, relative, float((np.minimum(relative, WRONG_STDS) ** 2).sum())
 
-    likely, worst, cost = CAUSES, "", np.inf
+    likely, worst, cost = CAUSES, "", len(names) * WRONG_STDS**2
     if fit is not None:
         away, relative, cost = misfit(fit)
         far = [f"{names[k]} by {away[k]:.3g} m" for k in np.argsort(-away)[:MIN_FIXES]]
         worst = f", worst {', '.join(far)}"
-        bent = np.median(away) < MAX_BEND * np.nanstd(targets, axis=0).max()
+        bent = np.median(away) < MAX_BEND * np.nan_to_num(targets).std(axis=0).max()
         likely = "" if bent or np.median(relative) < WRONG_STDS else CAUSES
-    for reading, matrix in READINGS.items() if cost > len(names) else ():
+    for reading, (axes, factor) in READINGS.items() if cost > len(names) else ():
         with suppress(ReconstructionError):
-            shrunk = min(abs(float(np.linalg.det(matrix))), 1)
-            other = misfit(fit_similarity(own, targets @ matrix, **known), shrunk)
-            if other[2] < MUCH_BETTER * min(cost, len(names) * WRONG_STDS**2):
+            other = fit_similarity(own, targets[:, axes] * [1, 1, factor], **known)
+            if misfit(other, min(factor, 1))[2] < MUCH_BETTER * cost:
                 likely = f"whether {reading}, which fits far better"
     if likely:
         raise NoPlaceError(f"the ground control points contradict the model{worst}: check {likely}")
@@ -390,7 +390,7 @@ def _seen_by_several(
             rows = seen.setdefault(row.name, {})
             rows[names[row.image]] = row
             if not np.array_equal(row.place, next(iter(rows.values())).place, equal_nan=True):
-                raise NoPlaceError(f"the control point {row.name} has two places: name it twice")
+                raise NoPlaceError(f"{row.name} is the name of two control points: change one")
     seen = {name: rows for name, rows in seen.items() if len(rows) > 1}
     if len(seen) < MIN_FIXES:
         raise OptionError(
