@@ -90,14 +90,14 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
     if not (len(rows) and known and all(row[5] for row in rows)) or np.isinf(z).any():
         raise ValueError(f"it has no points, or one without an image, or outside of {system}")
     # Zones are used beyond their borders, so the place may be as far off as the area is large.
-    area = crs.area_of_use
-    width = (area.east - area.west) % 360 or 360 if area else 360
-    aside = abs((np.median(longitude) - area.west - width / 2 + 180) % 360 - 180) if area else 0
-    above = abs(2 * np.median(latitude) - area.north - area.south) if area else 0
-    if area and (aside > 1.5 * width or above > 3 * (area.north - area.south)):
-        text = f"the ground control points are far from where {crs.name} is used: check the "
-        text += "coordinate system, the unit, and the order of the columns"
-        warnings.warn(text, UserWarning, stacklevel=2)
+    if area := crs.area_of_use:
+        width = (area.east - area.west) % 360 or 360
+        aside = (np.median(longitude) - area.west + width) % 360
+        above = abs(2 * np.median(latitude) - area.north - area.south)
+        if aside > 3 * width or above > 3 * (area.north - area.south):
+            text = f"the ground control points are far from where {crs.name} is used: check the "
+            text += "coordinate system, the unit, and the order of the columns"
+            warnings.warn(text, UserWarning, stacklevel=2)
     across, _, *up = crs.axis_info
     unit = (up or [across])[0].unit_conversion_factor if up or crs.is_projected else 1.0
     z = -unit * z if up and up[0].direction == "down" else unit * z

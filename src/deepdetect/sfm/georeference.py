@@ -319,8 +319,8 @@ def _check_control_points(
     likely, worst, cost = CAUSES, "", len(names) * WRONG_STDS**2
     if fit is not None:
         away, relative, cost = misfit(fit)
-        far = [f"{names[k]} by {away[k]:.3g} m" for k in np.argsort(-away)[:MIN_FIXES]]
-        worst = f", worst {', '.join(far)}"
+        for k in np.argsort(-away)[:MIN_FIXES]:
+            worst += f", {names[k]} by {away[k]:.3g} m"
         bent = np.median(away) < MAX_BEND * np.nan_to_num(targets).std(axis=0).max()
         likely = "" if bent or np.median(relative) < WRONG_STDS else CAUSES
     for reading, (axes, factor) in READINGS.items() if cost > len(names) else ():
@@ -366,14 +366,13 @@ def georeference_by_control_points(
     """Find the place of a model by the control points marked in two or more of its images."""
     seen = _seen_by_several(control, _by_file_name(sparse.images))
     points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
-    rows = [next(iter(rows.values())) for rows in seen.values()]
-    places = np.array([row.place for row in rows])
+    places = np.array([next(iter(rows.values())).place for rows in seen.values()])
     up, level, stds = upright(sparse.views)
     known: Any = {"scale": scale, "up": up, "level": level, "level_stds": stds}
     views = [(sparse.images[image].view, point) for point in seen for image in seen[point]]
     pixels = [np.linalg.norm(points[k] - v.centre) / v.camera.focal_px[0] for v, k in views]
     error = float(np.median(pixels) * np.median(sparse.errors))
-    what = "ground control points", points, places, CONTROL_ACCURACY_M, rows[0].heights
+    what = "ground control points", points, places, CONTROL_ACCURACY_M, control[0].heights
     return _place(*what, error, **known)
 
 
