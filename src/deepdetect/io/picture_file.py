@@ -254,13 +254,11 @@ def _read_place(path: Path, page: Any, orientation: int) -> dict[str, Any]:
             if file.crs is None and ".prj" in beside:
                 text = beside[".prj"].read_text("utf-8")
                 place["crs"] = rasterio.CRS.from_user_input(text)
-    problem, crs = "", place.get("crs")
-    if "to_world" not in place:
-        problem = NO_MATRIX if stated else ""
+    crs = place.get("crs")
+    if stated and "to_world" not in place:
+        warnings.warn(NO_MATRIX, UserWarning, stacklevel=2)
     elif tagged and not (crs and (crs.is_geographic or crs.is_projected)):
-        problem = NO_SYSTEM
-    if problem:
-        warnings.warn(problem, UserWarning, stacklevel=2)
+        warnings.warn(NO_SYSTEM, UserWarning, stacklevel=2)
     return place
 
 
