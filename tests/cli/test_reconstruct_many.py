@@ -92,6 +92,16 @@ def test_a_list_of_photographs_and_results_within_the_folder(
     centres = [np.array(values["cameras"][name]["centre"]) for name in ("0004.jpg", "0006.jpg")]
     assert np.linalg.norm(centres[1] - centres[0]) == pytest.approx(2.5)
     assert run("reconstruct", ".", *few, "--format", "map").exit_code == 2
+    # Points that are not where they are marked.
+    pytest.importorskip("pyproj", reason="needs pyproj")
+    places = np.random.default_rng(0).uniform(0, 100, (6, 3)) + [500_000, 5_000_000, 0]
+    marks = [
+        f"{x} {y} {z} {50 * k + 40} {30 * k + 30} {name} mark {k}"
+        for k, (x, y, z) in enumerate(places)
+        for name in ("0004.jpg", "0006.jpg")
+    ]
+    (fountain / "gcp_list.txt").write_text("\n".join(["EPSG:32632", *marks]))
+    assert run("reconstruct", ".", *few, "--gcp", "gcp_list.txt").exit_code == 3
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,45 @@ def test_xmp_of_a_drone_is_finer_and_knows_gravity(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("north", "east", "expected", "assumed"),
+    [
+        ("N", "E", (10, 20), False),
+        ("s", "West", (-10, -20), False),
+        ("South", "e", (-10, 20), False),
+        (None, "W", (10, -20), True),
+        ("S", None, (-10, 20), True),
+        ("", "?", (10, 20), True),
+    ],
+)
+def test_letters_of_hemispheres(
+    north: str | None, east: str | None, expected: tuple, assumed: bool, tmp_path: Path
+) -> None:
+    letters = {GPS.GPSLatitudeRef: north, GPS.GPSLongitudeRef: east}
+    tags = place_tags(10, 20) | letters
+    fix = read_gps(
+        write_photograph(tmp_path / "a.jpg", {k: v for k, v in tags.items() if v is not None})
+    )
+    assert fix is not None
+    assert (fix.latitude, fix.longitude) == expected
+    assert fix.assumed_hemisphere == assumed
+
+
+@pytest.mark.parametrize(("reference", "sign"), [(0, 1), (1, -1), (2, 1), (3, -1), (None, 1)])
+def test_what_altitudes_refer_to(reference: int | None, sign: int, tmp_path: Path) -> None:
+    tags = place_tags(10, 20, 5.0)
+    del tags[GPS.GPSAltitudeRef]
+    if reference is not None:
+        tags[GPS.GPSAltitudeRef] = bytes([reference])
+    fix = read_gps(write_photograph(tmp_path / "a.jpg", tags))
+    assert fix is not None
+    assert (fix.altitude, fix.reference) == (5 * sign, "above sea level")
+    only = XMP.format('drone-dji:RelativeAltitude="+80.0"')
+    fix = read_gps(write_photograph(tmp_path / "a.jpg", tags, only))
+    assert fix is not None
+    assert (fix.altitude, fix.above_take_off) == (5 * sign, 80)
+
+
+@pytest.mark.parametrize(
     "tags", [{}, place_tags(0, 0), {GPS.GPSLatitudeRef: "N"}, place_tags(91, 5)]
 )
 def test_what_is_no_place_is_none(tmp_path: Path, tags: dict) -> None:

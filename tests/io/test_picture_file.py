@@ -3,7 +3,9 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -196,7 +198,8 @@ def test_corners_of_geotiff_are_those_of_gdal(
         file.crs = crs or rasterio.CRS()
         if point:
             file.update_tags(AREA_OR_POINT="Point")
-    found = read_metadata(tmp_path / "a.tif", placed=True)
+    with nullcontext() if crs else pytest.warns(UserWarning, match="GeoTIFF"):
+        found = read_metadata(tmp_path / "a.tif", placed=True)
     assert found.to_world is not None
     with rasterio.open(tmp_path / "a.tif") as file:
         expected = [file.xy(0, 0), file.xy(7, 11)]
@@ -231,17 +234,96 @@ def test_a_tie_point_inside_and_a_second_page(second_page: bool, tmp_path: Path)
     assert found.crs.to_epsg() == UTM
 
 
-@pytest.mark.parametrize("world", ["jgw", "JGW", "jpgw", "pgw", "pngw", "tfw", "wld", "bpw", "j2w"])
-def test_world_files_of_all_names(world: str, tmp_path: Path) -> None:
-    pytest.importorskip("rasterio")
-    kinds = {"j": "jpg", "p": "png", "t": "tif", "b": "bmp", "w": "jpeg"}
-    image = "jp2" if world == "j2w" else kinds[world[0].lower()]
-    Image.new("RGB", (30, 20)).save(tmp_path / f"a.{image}")
-    (tmp_path / f"a.{world}").write_text("0.5\n0.1\n0.2\n0.25\n1000.25\n1999.75\n")
-    found = read_metadata(tmp_path / f"a.{image}", placed=True)
-    expected = [[0.5, 0.2, 1000.25], [0.1, 0.25, 1999.75], [0, 0, 1]]
-    np.testing.assert_allclose(found.to_world, expected)
+@pytest.mark.parametrize(
+    "names",
+    [
+        *("jpg jgw", "jpg JGW", "jpg Jgw", "JPG jpgw", "jpeg jpegw", "jpeg wld", "jpg WLD"),
+        *("png pgw", "PNG PNGw", "tif tfw", "tiff tfw", "tiff TIFFW", "tif Wld", "bmp bpw"),
+        *("bmp bmpw", "gif GFW", "jp2 j2w", "ppm wld", "jpg jpg.aux.xml"),
+    ],
+)
+def test_files_of_a_place_of_all_names(names: str, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    image, world = (tmp_path / f"a.{ending}" for ending in names.split())
+    Image.new("RGB", (30, 20)).save(image)
+    if world.suffix == ".xml":
+        world.write_text(
+            "<PAMDataset><GeoTransform>999.9, 0.5, 0.2, 1999.575, 0.1, 0.25</GeoTransform>"
+            "</PAMDataset>"
+        )
+    else:
+        world.write_text("0.5\n0.1\n0.2\n0.25\n1000.25\n1999.75\n")
+    found = read_metadata(image, placed=True)
+    with rasterio.open(image) as file:
+        expected = [file.xy(0, 0), file.xy(7, 11)]
+    assert found.to_world is not None
+    np.testing.assert_allclose(transform_points([[0, 0], [11, 7]], found.to_world), expected)
+    np.testing.assert_allclose(expected, [(1000.25, 1999.75), (1007.15, 2002.6)])
     assert found.crs is None
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+@pytest.mark.parametrize("name", ["a.jpg", "a.tif"])
+def test_a_turned_image_keeps_its_place(orientation: int, name: str, tmp_path: Path) -> None:
+    """GDAL places the pixels as they are stored, and `load_image` turns them upright."""
+    rasterio = pytest.importorskip("rasterio")
+    stored = np.zeros((32, 48, 3), np.uint8)
+    stored[8:16, 32:40] = 255
+    exif = Image.Exif()
+    exif[Base.Orientation] = orientation
+    Image.fromarray(stored).save(tmp_path / name, exif=exif)
+    (tmp_path / f"a.{name[2]}{name[-1]}w").write_text("0.5\n0.1\n0.2\n-0.5\n1000\n2000\n")
+    found = read_metadata(tmp_path / name, placed=True)
+    upright = load_image(tmp_path / name)
+    y, x = np.argwhere(upright[:, :, 0] > 128).mean(axis=0)
+    with rasterio.open(tmp_path / name) as file:
+        expected = file.xy(11.5, 35.5)
+    np.testing.assert_allclose(transform_points([[x, y]], found.to_world), [expected])
+
+
+@pytest.mark.parametrize("kind", ["ground control points", "RPC", "webp"])
+def test_a_place_that_is_no_matrix_is_told(kind: str, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    how: dict[str, Any] = {"driver": "GTiff", "width": 30, "height": 20, "count": 1}
+    if kind == "RPC":
+        line = " ".join(["1"] + ["0"] * 19)
+        scale = {f"{name}_{what}": "1" for name in ("LINE", "SAMP") for what in ("OFF", "SCALE")}
+        scale |= {
+            f"{name}_{w}": "1" for name in ("LAT", "LONG", "HEIGHT") for w in ("OFF", "SCALE")
+        }
+        terms = {f"{a}_{b}_COEFF": line for a in ("LINE", "SAMP") for b in ("NUM", "DEN")}
+        how["rpcs"] = rasterio.rpc.RPC.from_gdal(scale | terms)
+    elif kind != "webp":
+        how["gcps"] = [
+            rasterio.control.GroundControlPoint(row, column, 500 + column, 900 - row, 0)
+            for row, column in ((0, 0), (0, 30), (20, 0), (20, 29))
+        ]
+        how["crs"] = "EPSG:32632"
+    path = tmp_path / ("a.webp" if kind == "webp" else "a.tif")
+    if kind == "webp":  # GDAL reads no world file of it
+        Image.new("RGB", (30, 20)).save(path)
+        (tmp_path / "a.wld").write_text("0.5\n0\n0\n-0.5\n1000\n2000\n")
+    else:
+        gcps = how.pop("gcps", None)
+        crs = how.pop("crs", None)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(path, "w", dtype="uint8", **how) as file:
+                if gcps:
+                    file.gcps = (gcps, rasterio.CRS.from_user_input(crs))
+    with pytest.warns(UserWarning, match="place"):
+        assert read_metadata(path, placed=True).to_world is None
+
+
+@pytest.mark.parametrize("name", ["PAN.JPG", "PAN.PNG", "pan.jpeg"])
+def test_a_world_file_has_the_case_of_its_image(name: str, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    save_picture(np.zeros((20, 30, 3), np.uint8), tmp_path / name)
+    Metadata(to_world=np.array([[2.0, 0, 5], [0, -2, 7], [0, 0, 1]])).write_beside(tmp_path / name)
+    (world,) = {each.suffix for each in tmp_path.iterdir()} - {Path(name).suffix}
+    assert world.isupper() == name.isupper()
+    with rasterio.open(tmp_path / name) as file:
+        assert file.transform.to_gdal() == (4.0, 2.0, 0.0, 8.0, 0.0, -2.0)
 
 
 def test_without_rasterio_a_place_is_said_not_lost(

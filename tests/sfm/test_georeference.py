@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL.ExifTags import GPS
 
 from deepdetect import (
     Camera,
@@ -16,8 +17,10 @@ from deepdetect import (
     ReconstructionError,
     reconstruct_many,
 )
+from deepdetect._shared.errors import NoPlaceError
 from deepdetect.geometry.camera import PosedView
 from deepdetect.geometry.similarity import Similarity
+from deepdetect.io.gps import read_gps
 from deepdetect.sfm import MultiViewOptions
 from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.georeference import (
@@ -219,6 +222,187 @@ def test_ground_control_points(pycolmap, tmp_path: Path, hidden: Similarity) -> 
     )
     with pytest.raises(ReconstructionError):
         georeference(sparse, sparse.points, tmp_path, read_control_points(path))
+
+
+def surveyed(
+    hidden: Similarity, relief: float = 8.0
+) -> tuple[SparseModel, np.ndarray, np.ndarray, list[tuple[str, int, np.ndarray]]]:
+    """Make a model, its control points in metres and in UTM, and the pixels that show them."""
+    random = np.random.default_rng(0)
+    centres = np.column_stack([np.arange(6) * 12.0, random.normal(0, 3, 6), np.full(6, 3.0)])
+    marks = np.column_stack(
+        [random.uniform(0, 60, 8), random.uniform(25, 45, 8), random.uniform(0, relief, 8)]
+    )
+    rotations = [NORTH_LEVEL @ turn("z", heading) for heading in (-40, 25, -10, 35, -30, 15)]
+    sparse = made_model(centres, rotations, marks, hidden)
+    utm, _ = ORIGIN.to_utm(marks)
+    shown = [(n, k, xy) for n, each in sparse.images.items() for k, xy in enumerate(each.xy)]
+    return sparse, marks, utm, shown
+
+
+def survey_file(
+    path: Path, system: str, xyz: np.ndarray, shown: list[tuple[str, int, np.ndarray]]
+) -> Path:
+    rows = [
+        "\t".join([*map(repr, xyz[k].tolist()), *map(repr, xy.tolist()), image, f"mark {k}"])
+        for image, k, xy in shown
+    ]
+    path.write_text("\n".join([system, *rows]))
+    return path
+
+
+@pytest.mark.parametrize("relief", [2.0, 30.0])
+@pytest.mark.parametrize("mistake", ["feet", "metres", "exchanged", "columns", "names", "none"])
+def test_residuals_that_nothing_explains(
+    pycolmap, tmp_path: Path, hidden: Similarity, mistake: str, relief: float
+) -> None:
+    pytest.importorskip("pyproj", reason="needs pyproj")
+    sparse, marks, utm, shown = surveyed(hidden, relief=relief)
+    sparse = replace(sparse, errors=np.full(len(sparse.errors), 0.6))
+    random = np.random.default_rng(1)
+    xyz = utm + random.normal(0, 0.03, utm.shape)
+    shown = [(n, k, xy + random.normal(0, 0.3, 2)) for n, k, xy in shown]
+    if mistake in ("feet", "metres"):
+        xyz[:, 2] *= {"feet": 1 / 0.3048, "metres": 0.3048}[mistake]
+        xyz[0, 2] = np.nan  # one height is unknown
+    elif mistake == "exchanged":
+        shift = xyz[:, :2].mean(axis=0)
+        xyz[:, :2] = (xyz[:, :2] - shift)[:, ::-1] + shift
+    elif mistake == "columns":
+        shown = [(n, k, xy[::-1]) for n, k, xy in shown]
+    elif mistake == "names":
+        xyz = xyz[random.permutation(len(xyz))]
+    path = survey_file(tmp_path / "gcp.txt", "EPSG:32632", xyz, shown)
+    control = read_control_points(path)
+    if mistake != "none":
+        with pytest.raises(NoPlaceError, match=mistake if mistake in ("feet", "metres") else None):
+            georeference(sparse, sparse.points, tmp_path, control)
+        return
+    found = georeference(sparse, sparse.points, tmp_path, control)
+    assert isinstance(found, Georeference)
+    np.testing.assert_allclose(
+        found.similarity.apply(sparse.points)[0],
+        marks[0]
+        - (
+            ORIGIN.to_enu(
+                np.array([[found.origin.latitude, found.origin.longitude, found.origin.height]])
+            )[0]
+        ),
+        atol=0.3,
+    )
+    assert "WGS 84 / UTM" in found.summary()["origin"]["height_is"]
+
+
+def test_a_bent_model_is_no_mistake_of_the_points(
+    pycolmap, tmp_path: Path, hidden: Similarity
+) -> None:
+    """Heights in a model of unknown lenses are bent along 60 metres: that is written down."""
+    pytest.importorskip("pyproj", reason="needs pyproj")
+    sparse, marks, utm, shown = surveyed(hidden)
+    bent = utm.copy()
+    bent[:, 2] += 2.5 * ((marks[:, 0] - 30) / 30) ** 2
+    control = read_control_points(survey_file(tmp_path / "g.txt", "EPSG:32632", bent, shown))
+    found = georeference(sparse, sparse.points, tmp_path, control)
+    assert isinstance(found, Georeference)
+    assert found.summary()["median_residual_up_m"] > 0.05
+
+
+@pytest.mark.parametrize("system", ["EPSG:2249", "EPSG:2249+6360", "EPSG:2249+5703", "EPSG:26986"])
+def test_a_model_in_feet_is_that_in_metres(
+    pycolmap, tmp_path: Path, hidden: Similarity, system: str
+) -> None:
+    pyproj = pytest.importorskip("pyproj", reason="needs pyproj")
+    sparse, _, utm, shown = surveyed(hidden)
+    foot = 1200 / 3937
+    metres = utm - utm.mean(axis=0) + [236000, 901000, 50]
+    to = pyproj.Transformer.from_crs(26986, system.split("+")[0], always_xy=True)
+    x, y = to.transform(*metres.T[:2])
+    up = metres[:, 2] / (foot if system in ("EPSG:2249", "EPSG:2249+6360") else 1)
+    path = survey_file(tmp_path / "g.txt", system, np.column_stack([x, y, up]), shown)
+    found = georeference(sparse, sparse.points, tmp_path, read_control_points(path))
+    assert isinstance(found, Georeference)
+    assert found.origin is not None
+    assert found.similarity.scale == pytest.approx(hidden.scale, rel=1e-3)
+    assert found.origin.height == pytest.approx(50, abs=5)
+    assert found.summary()["median_residual_across_m"] < 0.01
+
+
+def test_one_name_of_two_places_is_refused(pycolmap, tmp_path: Path, hidden: Similarity) -> None:
+    pytest.importorskip("pyproj", reason="needs pyproj")
+    sparse, _, utm, shown = surveyed(hidden)
+    path = survey_file(tmp_path / "g.txt", "EPSG:32632", utm, shown)
+    path.write_text(path.read_text().replace("mark 3", "mark 4"))
+    with pytest.raises(NoPlaceError, match="mark 4"):
+        georeference(sparse, sparse.points, tmp_path, read_control_points(path))
+
+
+DJI = 'drone-dji:{}="{}"'
+
+
+@pytest.mark.parametrize(
+    ("kinds", "height", "expected"),
+    [
+        (["relative"] * 8, 80, "take-off"),
+        (["absolute relative"] * 8, 430, "sea level"),
+        (["relative"] * 3 + ["absolute relative"] * 5, 80, "take-off"),
+        (["relative"] * 3 + ["absolute"] * 5, 430, "sea level"),
+        (["rtk relative"] * 5 + ["exif"] * 3, 430, "ellipsoid"),
+        (["exif relative"] * 8, 430, "sea level"),
+        (["below"] * 8, -430, "sea level"),
+        (["relative"] * 7 + ["none"], None, "unknown"),
+    ],
+)
+def test_heights_of_one_kind_and_what_they_are(
+    pycolmap,
+    kinds: list[str],
+    height: float | None,
+    expected: str,
+    tmp_path: Path,
+    hidden: Similarity,
+) -> None:
+    random = np.random.default_rng(0)
+    centres = np.column_stack([random.uniform(0, 300, (8, 2)), np.full(8, 80.0)])
+    sparse = made_model(centres, [turn("x", 90) @ NORTH_LEVEL] * 8, np.zeros((1, 3)), hidden)
+    write_fixes(tmp_path, centres)
+    for k, kind in enumerate(kinds):
+        path = tmp_path / f"{k:02}.jpg"
+        fix = read_gps(path)
+        assert fix is not None
+        altitude = {"exif": 430.0, "below": -430.0}.get(kind.split()[0])
+        words = []
+        if "relative" in kind:
+            words.append(DJI.format("RelativeAltitude", "+80.0"))
+        if "absolute" in kind or "rtk" in kind:
+            words.append(DJI.format("AbsoluteAltitude", "+430.0"))
+        if "rtk" in kind:
+            words.append(DJI.format("RtkFlag", "50"))
+        write_photograph(
+            path, place_tags(fix.latitude, fix.longitude, altitude), f"<a {' '.join(words)}/>"
+        )
+    found = georeference(sparse, sparse.points, tmp_path)
+    assert isinstance(found, Georeference)
+    origin = found.summary()["origin"]
+    assert expected in origin["height_is"]
+    assert origin["height"] == pytest.approx(0 if height is None else height)
+    assert (origin["crs"] == "EPSG:4979") == (expected == "ellipsoid")
+
+
+def test_missing_hemispheres_are_told_once(pycolmap, tmp_path: Path, hidden: Similarity) -> None:
+    random = np.random.default_rng(0)
+    centres = np.column_stack([random.uniform(0, 300, (6, 2)), np.full(6, 80.0)])
+    sparse = made_model(centres, [NORTH_LEVEL] * 6, np.zeros((1, 3)), hidden)
+    write_fixes(tmp_path, centres)
+    for k in range(6):
+        path = tmp_path / f"{k:02}.jpg"
+        fix = read_gps(path)
+        assert fix is not None
+        tags = place_tags(fix.latitude, fix.longitude, fix.altitude)
+        del tags[GPS.GPSLatitudeRef]
+        write_photograph(path, tags)
+    with pytest.warns(UserWarning, match="north") as told:
+        found = georeference(sparse, sparse.points, tmp_path)
+    assert len(told) == 1
+    assert isinstance(found, Georeference)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -43,6 +43,10 @@ class NoDepthError(ReconstructionError):
     """The images show no depth or do not overlap; the command line ends with exit code 3."""
 
 
+class NoPlaceError(ReconstructionError):
+    """Ground control points contradict the model; the command line ends with exit code 3."""
+
+
 class MissingExtraError(DeepDetectError, ImportError):
     """A call needs an optional package that is not installed; an `ImportError`."""
 

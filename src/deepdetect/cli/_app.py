@@ -22,6 +22,7 @@ from .._shared.errors import (
     DeepDetectError,
     MissingExtraError,
     NoDepthError,
+    NoPlaceError,
     RegistrationError,
 )
 from .._shared.progress import STDERR, fails, say
@@ -204,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines = [f"{error.summary}:", *(f"  {with_flags(each, words)}" for each in error.failures)]
         return _failed("\n".join(lines), 1)
     except DeepDetectError as error:
-        nothing_found = isinstance(error, NoDepthError | RegistrationError)
+        nothing_found = isinstance(error, NoDepthError | NoPlaceError | RegistrationError)
         return _failed(with_flags(str(error), words), NOTHING_FOUND if nothing_found else 2)
     except KeyboardInterrupt:
         return _failed("stopped; what was written stays", 130)

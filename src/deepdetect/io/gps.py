@@ -15,6 +15,9 @@ from .image_file import open_image
 XMP_OF_DRONES = re.compile(rb"(?<!/)drone-dji:(\w+)\s*(?:=\s*[\"']([^\"']*)|>([^<]*))")
 """This pattern finds XMP properties of DJI drones, which write them as attributes or elements."""
 
+ELLIPSOID, SEA_LEVEL, TAKE_OFF = "above the ellipsoid", "above sea level", "above take-off"
+"""What heights are measured from."""
+
 MAX_GRAVITY_TILT_DEG = 120.0
 """Larger gimbal angles, in degrees, are treated as invalid. Chosen by hand."""
 
@@ -25,10 +28,13 @@ class GpsFix:
 
     Attributes:
         latitude, longitude: in degrees, north and east positive.
-        altitude: in metres as the camera states it, mostly above sea level; NaN if unknown.
+        altitude: in metres as the camera states it; NaN if unknown.
         accuracy_m: horizontal standard deviation in metres as the camera states it, or None.
         gravity: (3,) unit vector towards the ground in the camera's frame (x right, y down, z
             forward), computed from the gimbal's angles, or None.
+        reference: what `altitude` is measured from: `SEA_LEVEL`, or with RTK `ELLIPSOID`.
+        above_take_off: metres above the place where a drone took off; NaN if unknown.
+        assumed_hemisphere: whether north or east are assumed, because nothing states them.
     """
 
     latitude: float
@@ -36,6 +42,9 @@ class GpsFix:
     altitude: float
     accuracy_m: float | None = None
     gravity: np.ndarray | None = None
+    reference: str = SEA_LEVEL
+    above_take_off: float = np.nan
+    assumed_hemisphere: bool = False
 
 
 def read_gps(path: Path) -> GpsFix | None:
@@ -52,21 +61,21 @@ def read_gps(path: Path) -> GpsFix | None:
         return None
     found = XMP_OF_DRONES.findall(xmp if isinstance(xmp, bytes) else xmp.encode())
     drone = {name.decode(): _number(one or other) for name, one, other in found}
-    latitude, longitude = (
-        _degrees(tags.get(tag), tags.get(sign), below)
-        for tag, sign, below in (
-            (GPS.GPSLatitude, GPS.GPSLatitudeRef, "S"),
-            (GPS.GPSLongitude, GPS.GPSLongitudeRef, "W"),
-        )
-    )
-    below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01")
+    signs = (str(tags.get(tag, "")) for tag in (GPS.GPSLatitudeRef, GPS.GPSLongitudeRef))
+    north_south, east_west = (sign.strip().upper()[:1] for sign in signs)
+    latitude = _degrees(tags.get(GPS.GPSLatitude), north_south == "S")
+    longitude = _degrees(tags.get(GPS.GPSLongitude), east_west == "W")
+    assumed = north_south not in ("N", "S") or east_west not in ("E", "W")
+    # EXIF 3.0 adds 2 and 3 for heights above and below sea level.
+    below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01", 3, b"\x03")
     altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if below_sea else 1)
     # Older drones write "Longtitude".
     east = drone.get("GpsLongitude", drone.get("GpsLongtitude", np.nan))
-    if np.isfinite(east) and np.isfinite(north := drone.get("GpsLatitude", np.nan)):
-        latitude, longitude = (north, east) if north or east else (latitude, longitude)
-    for name in ("RelativeAltitude", "AbsoluteAltitude"):
-        altitude = drone[name] if np.isfinite(drone.get(name, np.nan)) else altitude
+    north, absolute = (drone.get(name, np.nan) for name in ("GpsLatitude", "AbsoluteAltitude"))
+    if np.isfinite(east + north) and (north or east):
+        latitude, longitude, assumed = north, east, False
+    altitude = absolute if np.isfinite(absolute) else altitude
+    rtk = np.isfinite(absolute) and drone.get("RtkFlag", 0) > 0
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
         return None
     spread = np.hypot(drone.get("RtkStdLat", np.nan), drone.get("RtkStdLon", np.nan))
@@ -77,6 +86,9 @@ def read_gps(path: Path) -> GpsFix | None:
         altitude,
         accuracy if accuracy > 0 else None,
         _gravity(drone) if orientation == 1 else None,
+        ELLIPSOID if rtk else SEA_LEVEL,
+        drone.get("RelativeAltitude", np.nan),
+        assumed,
     )
 
 
@@ -89,14 +101,14 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
     return np.array([np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch), -np.sin(pitch)])
 
 
-def _degrees(value: Any, sign: Any, below: str) -> float:
-    """Convert degrees, minutes, seconds to degrees: < 0 if `sign` is `below`, NaN if invalid."""
+def _degrees(value: Any, below: bool) -> float:
+    """Convert degrees, minutes, seconds to degrees: < 0 if `below` zero, NaN if invalid."""
     try:
         degrees, minutes, seconds = (_number(part) for part in value)
     except (TypeError, ValueError):
         return np.nan
     sum_ = degrees + minutes / 60 + (seconds if np.isfinite(seconds) else 0) / 3600
-    return -sum_ if str(sign).strip().upper() == below else sum_
+    return -sum_ if below else sum_
 
 
 def _number(value: Any) -> float:

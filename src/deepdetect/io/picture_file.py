@@ -21,14 +21,17 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError, require_packages
 from .._shared.image_array import to_8_bits
 from .._shared.opencv import cv2
+from .image import UPRIGHT
 from .image_file import open_file, open_image, reading_options
 from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
 """Tags of GeoTIFF for pixel scale and transformation. A georeferenced TIFF has one of them."""
 
-PLACED_FORMATS = ("TIFF", "JPEG", "PNG", "JPEG2000", "BMP", "GIF")
-"""Pillow's names of formats whose georeference GDAL can read."""
+NO_MATRIX = "the place of an image is not kept, since no affine matrix that GDAL reads states it: \
+warp an image with ground control points or RPCs by gdalwarp first"
+NO_SYSTEM = "a GeoTIFF without a coordinate system keeps its place as that of a local grid: assign \
+the system by gdal_edit.py -a_srs if you know it"
 
 FIRST_CENTRE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 """This matrix maps the package's pixel coordinates, whose origin is the centre of the first pixel,
@@ -88,7 +91,9 @@ class Metadata:
         if self.to_world is None or path.suffix.lower() in (".tif", ".tiff"):
             return
         numbers = self.to_world[:2].T.ravel()
-        texts = {_world_files(path)[0]: "".join(f"{number:.17g}\n" for number in numbers)}
+        ending = _world_endings(path)[0]
+        world = path.with_suffix(ending.upper() if path.suffix.isupper() else ending)
+        texts = {world: "".join(f"{number:.17g}\n" for number in numbers)}
         with suppress(AttributeError, ValueError):  # no CRS, or one that WKT1 cannot state
             texts[path.with_suffix(".prj")] = self.crs.to_wkt(version="WKT1_ESRI")
         for place, text in texts.items():
@@ -220,31 +225,49 @@ def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
         kept = _kept_exif(exif) if kind == "TIFF" else exif
         found = replace(found, exif=kept if len(kept) else None)
         orientation = exif.get(Base.Orientation, 1)
-    # The georeference applies to the stored image, before it is turned upright.
-    if placed and path is not None and kind in PLACED_FORMATS and orientation == 1:
-        found = replace(found, **_read_place(path, page))
+    if placed and path is not None and kind:
+        found = replace(found, **_read_place(path, page, orientation))
     return found
 
 
-def _read_place(path: Path, page: Any) -> dict[str, Any]:
+def _read_place(path: Path, page: Any, orientation: int) -> dict[str, Any]:
     """Return `to_world` and `crs` of an image file, or of a page of a TIFF file, if known."""
     place: dict[str, Any] = {}
+    files, stem = path.absolute().parent.glob("*"), path.stem.lower()
+    beside = {each.suffix.lower(): each for each in files if each.stem.lower() == stem}
     tagged = page is not None and {PIXEL_SCALE, TRANSFORMATION} & {*page.tags.keys()}
-    if not (tagged or any(each.is_file() for each in _world_files(path))):
-        return place
-    require_packages(f"the georeference of {path}", "rasterio")
+    stated = bool(tagged or beside.keys() & {*_world_endings(path)})
+    if stated:
+        require_packages(f"the georeference of {path}", "rasterio")
     name = str(path.absolute())  # GDAL may read `a:b` as DRIVER:FILE
     if page is not None and page.index:
         name = f"GTIFF_DIR:{page.index + 1}:{name}"
     # Files that GDAL cannot read have no georeference; a bad .prj file raises a ValueError.
-    with _rasterio() as rasterio, suppress(OSError, ValueError), rasterio.open(name) as file:
-        if not file.transform.is_identity:
-            place["to_world"] = np.reshape(file.transform, (3, 3)) @ FIRST_CENTRE
+    missing = OSError, ValueError, ImportError
+    with suppress(*missing), _rasterio() as rasterio, rasterio.open(name) as file:
+        if file.transform.is_identity:
+            stated = stated or bool(file.gcps[0] or file.rpcs)
+        else:
+            upright = _stored_pixels(orientation, file.width, file.height)
+            place["to_world"] = np.reshape(file.transform, (3, 3)) @ FIRST_CENTRE @ upright
             place["crs"] = file.crs
-            if file.crs is None:
-                text = path.with_suffix(".prj").read_text("utf-8")
+            if file.crs is None and ".prj" in beside:
+                text = beside[".prj"].read_text("utf-8")
                 place["crs"] = rasterio.CRS.from_user_input(text)
+    crs = place.get("crs")
+    if stated and "to_world" not in place:
+        warnings.warn(NO_MATRIX, UserWarning, stacklevel=2)
+    elif tagged and not (crs and (crs.is_geographic or crs.is_projected)):
+        warnings.warn(NO_SYSTEM, UserWarning, stacklevel=2)
     return place
+
+
+def _stored_pixels(orientation: int, width: int, height: int) -> np.ndarray:
+    """Return the (3, 3) matrix from pixels of the upright image to those of the stored one."""
+    stored = np.dstack(np.meshgrid([0.0, width - 1], [0.0, height - 1]))
+    (first, right), (down, _) = UPRIGHT.get(orientation, np.asarray)(stored)
+    axes = np.sign([right - first, down - first])
+    return np.vstack([np.column_stack([*axes, first]), [0, 0, 1]])
 
 
 @contextmanager
@@ -257,11 +280,10 @@ def _rasterio() -> Iterator[Any]:
         yield rasterio
 
 
-def _world_files(path: Path) -> list[Path]:
-    """Return the possible paths of an image's world file, the usual one first."""
-    ending = path.suffix[1:]
-    names = [f".{ending[:1]}{ending[-1:]}w", f".{ending}w", ".wld"]
-    return [path.with_suffix(name) for name in [*names, *map(str.upper, names)]]
+def _world_endings(path: Path) -> list[str]:
+    """Return the possible suffixes of an image's world file in lower case, the usual one first."""
+    ending = path.suffix[1:].lower()
+    return [f".{ending[:1]}{ending[-1:]}w", f".{ending}w", ".wld"]
 
 
 def _kept_exif(exif: Any) -> Any:

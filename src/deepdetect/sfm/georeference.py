@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, ReconstructionError, first_line, require_packages
+from .._shared.errors import NoPlaceError, OptionError, ReconstructionError
 from ..geometry.camera import PosedView
-from ..geometry.similarity import Similarity, SimilarityFit, fit_similarity
-from ..io.gps import read_gps
+from ..geometry.similarity import (
+    MUCH_BETTER,
+    WRONG_STDS,
+    Similarity,
+    SimilarityFit,
+    fit_similarity,
+)
+from ..io.gps import ELLIPSOID, SEA_LEVEL, TAKE_OFF, GpsFix, read_gps
 from ..io.image import find_images
 from .colmap import import_pycolmap
+from .control_points import ControlRow, read_control_points
 from .mapping import SparseModel
+
+__all__ = ["ControlRow", "Georeference", "Origin", "georeference", "read_control_points"]
 
 GPS_ACCURACY_M = 3.0
 """Assumed accuracy of GPS positions that state none. Usual receivers reach it in the open."""
@@ -53,6 +64,20 @@ weight times the mean optical axis, because cameras look down more often than up
 MAX_DISTANCE_PX = 15.0
 """A pixel that the user gives as the end of a known distance stands for a point of the model that
 projects to within this distance of the pixel. Chosen by hand."""
+
+MAX_BEND = 0.05
+"""A bent model has residuals of up to this share of the extent of its points; a mistake in the
+control points mostly makes larger ones. Chosen by hand."""
+
+READINGS: dict[str, tuple[list[int], float]] = {
+    "heights are in feet": ([0, 1, 2], 0.3048),
+    "heights are in metres": ([0, 1, 2], 1 / 0.3048),
+    "x and y are exchanged": ([1, 0, 2], 1),
+}
+"""Mistakes that leave coordinates plausible: the order of the axes and the factor of the heights
+that correct each one."""
+
+CAUSES = "the units, the order of the columns, the coordinate system, and the names of the images"
 
 NEARLY_A_LINE = "the positions lie nearly on a line: the rotation of the model about this line \
 follows from the assumption that the cameras are held upright"
@@ -99,6 +124,7 @@ class Georeference:
             name of the image (GPS) or of the control point.
         wrong: images or control points that were left out, because they contradict the others.
         fit: the fitted similarity with its uncertainty; None for a known distance.
+        heights: what heights are measured from, such as "above sea level"; none are converted.
     """
 
     similarity: Similarity
@@ -107,6 +133,7 @@ class Georeference:
     residuals: Mapping[str, np.ndarray] = field(default_factory=dict)
     wrong: tuple[str, ...] = ()
     fit: SimilarityFit | None = None
+    heights: str = "unknown"
 
     def summary(self) -> dict[str, Any]:
         """Return the values as plain Python types for JSON."""
@@ -115,10 +142,11 @@ class Georeference:
         good = np.array([r for name, r in self.residuals.items() if name not in self.wrong])
         up = np.abs(good[:, 2])[np.isfinite(good[:, 2])]
         alone = round(self.fit.axis_std_deg_of_targets, 2)
+        crs = "EPSG:4979" if self.heights == ELLIPSOID else "EPSG:4326"
         return {
             "source": self.source,
             "axes": "metres east, north and up of the origin",
-            "origin": vars(self.origin) | {"crs": "EPSG:4979"},
+            "origin": vars(self.origin) | {"crs": crs, "height_is": self.heights},
             "utm_crs": f"EPSG:{self.origin.to_utm(np.zeros((1, 3)))[1]}",
             "used": len(good),
             "wrong": list(self.wrong),
@@ -154,7 +182,7 @@ def georeference(
 
     Raises:
         OptionError: an end of the distance is not in the model, or it has too few control points.
-        ReconstructionError: the control points contradict the model.
+        NoPlaceError: the control points contradict the model.
     """
     scale = None
     if scale_by is not None:
@@ -207,12 +235,33 @@ def georeference_by_gps(
         raise ReconstructionError(
             f"{len(fixes)} of the images have GPS, but {MIN_FIXES} are needed"
         )
-    places = np.array([(fix.latitude, fix.longitude, fix.altitude) for fix in fixes.values()])
+    if assumed := [name for name, fix in fixes.items() if fix.assumed_hemisphere]:
+        what = f"the GPS of {len(assumed)} images, such as {assumed[0]}, lacks N or S, or E or W"
+        warnings.warn(f"{what}: north and east are assumed", UserWarning, stacklevel=2)
+    heights, altitudes = _altitudes([*fixes.values()])
+    places = np.array([(fix.latitude, fix.longitude) for fix in fixes.values()])
+    places = np.column_stack([places, altitudes])
     stated = [fix.accuracy_m for fix in fixes.values() if fix.accuracy_m is not None]
     accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M
     up, level, stds = upright(views, {name: fix.gravity for name, fix in fixes.items()})
     centres = {name: views[name].centre for name in fixes}
-    return _place("GPS", centres, places, accuracy, scale, up=up, level=level, level_stds=stds)
+    known: Any = {"scale": scale, "up": up, "level": level, "level_stds": stds}
+    return _place("GPS", centres, places, accuracy, heights, **known)
+
+
+def _altitudes(fixes: Sequence[GpsFix]) -> tuple[str, np.ndarray]:
+    """Return what most altitudes (N,) are measured from, and these; NaN for all others.
+
+    Each flight may have its own take-off point, so heights above it count only if all have one.
+    """
+    table = {name: np.full(len(fixes), np.nan) for name in (TAKE_OFF, SEA_LEVEL, ELLIPSOID)}
+    for k, fix in enumerate(fixes):
+        table[fix.reference][k] = fix.altitude
+    above = np.array([fix.above_take_off for fix in fixes])
+    if not np.isnan(above).any():
+        table[TAKE_OFF] = above
+    best = max(reversed(table), key=lambda name: np.isfinite(table[name]).sum())
+    return best, table[best]
 
 
 def _place(
@@ -220,8 +269,9 @@ def _place(
     points: Mapping[str, np.ndarray],
     places: np.ndarray,
     accuracy: float,
-    scale: float | None,
-    **upright: Any,
+    heights: str,
+    error: float | None = None,
+    **known: Any,
 ) -> Georeference:
     unknown = np.isnan(places[:, 2])
     places = np.where(np.isnan(places), 0 if unknown.all() else np.nanmedian(places[:, 2]), places)
@@ -229,23 +279,57 @@ def _place(
     origin = Origin(round(latitude, 6), round(longitude, 6), round(height, 1))
     targets = origin.to_enu(places)
     targets[unknown, 2] = np.nan
-    problem = ReconstructionError(
-        "the GPS positions contradict each other, or lie too close together for their accuracy"
-        if source == "GPS"
-        else "the ground control points do not agree with the model: check their coordinates, "
-        "pixels and image names"
-    )
-    try:
-        fit = fit_similarity(
-            np.array([*points.values()]), targets, accuracy, scale=scale, **upright
+    own = np.array([*points.values()])
+    known["accuracy"], fit = accuracy, None
+    with suppress(ReconstructionError):
+        fit = fit_similarity(own, targets, **known)
+        if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
+            fit = None
+    if error is not None:
+        _check_control_points(fit, points, targets, error, known)
+    if fit is None:
+        raise ReconstructionError(
+            "the GPS positions contradict each other, or lie too close together for their accuracy"
         )
-    except ReconstructionError:
-        raise problem from None
-    if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
-        raise problem
     residuals = dict(zip(points, fit.residuals, strict=True))
     wrong = tuple(name for name, is_wrong in zip(points, fit.wrong, strict=True) if is_wrong)
-    return Georeference(fit.similarity, source, origin, residuals, wrong, fit)
+    heights = "unknown" if unknown.all() else heights
+    return Georeference(fit.similarity, source, origin, residuals, wrong, fit, heights)
+
+
+def _check_control_points(
+    fit: SimilarityFit | None,
+    points: Mapping[str, np.ndarray],
+    targets: np.ndarray,
+    error: float,
+    known: Mapping[str, Any],
+) -> None:
+    """Raise a NoPlaceError if control points contradict a model, or fit better if read otherwise.
+
+    They contradict it if most residuals exceed what the accuracy of the targets, the `error` of the
+    points in the model, and a bend of the model explain.
+    """
+    own, names = np.array([*points.values()]), [*points]
+
+    def misfit(found: SimilarityFit, factor: float = 1) -> tuple[np.ndarray, np.ndarray, float]:
+        away = np.linalg.norm(np.nan_to_num(found.residuals), axis=1)
+        relative = away / np.hypot(known["accuracy"], found.similarity.scale * error) / factor
+        return away, relative, float((np.minimum(relative, WRONG_STDS) ** 2).sum())
+
+    likely, worst, cost = CAUSES, "", len(names) * WRONG_STDS**2
+    if fit is not None:
+        away, relative, cost = misfit(fit)
+        for k in np.argsort(-away)[:MIN_FIXES]:
+            worst += f", {names[k]} by {away[k]:.3g} m"
+        bent = np.median(away) < MAX_BEND * np.nan_to_num(targets).std(axis=0).max()
+        likely = "" if bent or np.median(relative) < WRONG_STDS else CAUSES
+    for reading, (axes, factor) in READINGS.items() if cost > len(names) else ():
+        with suppress(ReconstructionError):
+            other = fit_similarity(own, targets[:, axes] * [1, 1, factor], **known)
+            if misfit(other, min(factor, 1))[2] < MUCH_BETTER * cost:
+                likely = f"whether {reading}, which fits far better"
+    if likely:
+        raise NoPlaceError(f"the ground control points contradict the model{worst}: check {likely}")
 
 
 def upright(
@@ -276,49 +360,6 @@ def upright(
     return up / np.linalg.norm(up), np.array(level), np.radians(stds)
 
 
-class ControlRow(NamedTuple):
-    """A ground control point in an image. `place` is its latitude, longitude and height."""
-
-    name: str
-    place: tuple[float, float, float]
-    image: str
-    xy: np.ndarray
-
-
-def read_control_points(path: str | Path) -> list[ControlRow]:
-    """Read a file of ground control points in the format of OpenDroneMap.
-
-    The first line names the coordinate system, such as "EPSG:32633" or "WGS84 UTM 33N". Each other
-    line is `x y z column row image [name]`: a point's coordinates, its pixel in an image, the name
-    of the image, and perhaps that of the point.
-    """
-    require_packages("a file of ground control points", "pyproj")
-    from pyproj import CRS, Transformer
-
-    try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-        system, *lines = [line.strip() for line in lines if line.strip() and line[0] != "#"]
-        if zone := re.fullmatch(r"WGS84 UTM (\d+)([NS])", system):
-            system = f"EPSG:{(32600 if zone[2] == 'N' else 32700) + int(zone[1])}"
-        to_degrees = Transformer.from_crs(CRS.from_user_input(system), 4326, always_xy=True)
-        rows = []
-        for line in lines:
-            x, y, z, column, row, image, *name = line.split()
-            longitude, latitude = to_degrees.transform(float(x), float(y))
-            xy = np.array([float(column), float(row)])
-            place = latitude, longitude, float(z)
-            rows.append(ControlRow((name or [f"{x} {y} {z}"])[0], place, image, xy))
-    except OSError as error:
-        raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # an error of pyproj, or text in place of numbers
-        raise OptionError(
-            f"{path} is not a file of ground control points ({first_line(error)}): the first line "
-            "must be the coordinate system, such as EPSG:32633, and each other line 'x y z column "
-            "row image'"
-        ) from None
-    return rows
-
-
 def georeference_by_control_points(
     sparse: SparseModel, control: Sequence[ControlRow], scale: float | None = None
 ) -> Georeference:
@@ -327,8 +368,12 @@ def georeference_by_control_points(
     points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
     places = np.array([next(iter(rows.values())).place for rows in seen.values()])
     up, level, stds = upright(sparse.views)
-    known = {"up": up, "level": level, "level_stds": stds}
-    return _place("ground control points", points, places, CONTROL_ACCURACY_M, scale, **known)
+    known: Any = {"scale": scale, "up": up, "level": level, "level_stds": stds}
+    views = [(sparse.images[image].view, point) for point in seen for image in seen[point]]
+    pixels = [np.linalg.norm(points[k] - v.centre) / v.camera.focal_px[0] for v, k in views]
+    error = float(np.median(pixels) * np.median(sparse.errors))
+    what = "ground control points", points, places, CONTROL_ACCURACY_M, control[0].heights
+    return _place(*what, error, **known)
 
 
 def _seen_by_several(
@@ -341,7 +386,10 @@ def _seen_by_several(
     seen: dict[str, dict[str, ControlRow]] = {}
     for row in control:
         if row.image in names:
-            seen.setdefault(row.name, {})[names[row.image]] = row
+            rows = seen.setdefault(row.name, {})
+            rows[names[row.image]] = row
+            if not np.array_equal(row.place, next(iter(rows.values())).place, equal_nan=True):
+                raise NoPlaceError(f"{row.name} is the name of two control points: change one")
     seen = {name: rows for name, rows in seen.items() if len(rows) > 1}
     if len(seen) < MIN_FIXES:
         raise OptionError(
