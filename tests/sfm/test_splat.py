@@ -53,12 +53,12 @@ def splat(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     options.camera_params = numbers
     pycolmap.set_random_seed(0)
     model = pycolmap.synthesize_dataset(options)
-    dither = np.random.default_rng(0).uniform(-0.5, 0.5, (*SIZE[::-1], 3))
+    noise = np.random.default_rng(0).uniform(-8, 8, (*SIZE[::-1], 3))
     y, x = np.indices(SIZE[::-1])
     pixels = np.column_stack([x.ravel(), y.ravel()]) + 0.5
     for image in model.images.values():
         rays = np.asarray(image.camera.cam_from_img(pixels)).reshape(*SIZE[::-1], 2)
-        rgb = 128 + dither  # so that rounding has no preferred direction
+        rgb = 128 + noise  # so that rounding has no preferred direction
         rgb[..., :2] += rays @ LEVELS_PER_RAY
         Image.fromarray(np.rint(rgb).clip(0, 255).astype(np.uint8)).save(root / image.name)
     (root / "sparse" / "0").mkdir(parents=True)
@@ -113,8 +113,9 @@ def test_pixels_show_the_rays_of_the_camera(splat: Splat) -> None:
         down = (y + 0.5 - camera.height / 2) / camera.focal_length_y
         expected = 128 + np.stack([across, down], axis=2) @ LEVELS_PER_RAY
         difference = (rgb[..., :2] - expected)[4:-4, 4:-4]  # Lanczos reads beyond the border
-        assert np.abs(difference).max() < 3
-        assert np.abs(difference.mean(axis=(0, 1))).max() < 0.1  # a pixel is about a level
+        for rows in np.array_split(difference, 2):
+            for part in np.array_split(rows, 2, axis=1):
+                assert np.abs(part.mean(axis=(0, 1))).max() < 0.25  # a pixel is about a level
         assert rgb.min() > 0  # no empty border
 
 
