@@ -1,4 +1,7 @@
-"""OpenCV's classical detectors, with default settings and with the low thresholds of the paper."""
+"""OpenCV's classical detectors, with default settings and with the low thresholds of the paper.
+
+SIFT differs from OpenCV's default: it upscales precisely.
+"""
 
 from __future__ import annotations
 
