@@ -37,10 +37,6 @@ MAX_ROTATION_ERROR = 1e-3
 MAX_ASPECT_ERROR = 0.01
 """Image and camera may differ by this fraction in aspect ratio, since sizes are rounded."""
 
-GRID, MAX_DISTORTION_PX = 9, 0.01
-"""A camera is a pinhole camera if no pixel of a grid of this number of rows and columns is moved by
-this distance, which is less than the error of any match."""
-
 COLMAP_FILES = ("images.bin", "images.txt")
 
 
@@ -275,14 +271,14 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
 
 
 def _is_pinhole(camera: Any) -> bool:
-    """Whether a `pycolmap.Camera` maps the rays of all pixels as a pinhole camera does."""
+    """Whether a `pycolmap.Camera` sees the border of its image as a pinhole camera does."""
     if not camera.focal_length_idxs():  # a panorama
         return False
-    x, y = (np.linspace(0, side, GRID) for side in (camera.width, camera.height))
-    pixels = np.stack(np.meshgrid(x, y, [1.0]), axis=-1).reshape(-1, 3)
+    size = np.array([camera.width, camera.height])
+    pixels = np.array([(x, y, 1) for x in (0, size[0] / 2, size[0]) for y in (0, size[1])])
     rays = pixels @ np.linalg.inv(camera.calibration_matrix()).T
-    moved = np.asarray(camera.img_from_cam(rays)) - pixels[:, :2]
-    return bool((np.abs(moved) < MAX_DISTORTION_PX).all())
+    moved = (np.asarray(camera.img_from_cam(rays)) - pixels[:, :2]) / size
+    return bool((np.abs(moved) < np.finfo(np.float32).eps).all())
 
 
 def _read_located(folder: Path) -> list[PosedImage]:
