@@ -551,7 +551,7 @@ def directions(gray: Any, x: Any, y: Any, sizes: Any) -> Any:
                 gray, sigma = _blur(gray, (wanted**2 - sigma**2) ** 0.5, height, width), wanted
             if layer:
                 layers.append((gray.Flatten(), height, width))
-        # After slices up to `END` OpenVINO 2026.4 takes the width for the height.
+        # After a slice up to `END` by steps, OpenVINO 2026.4 confuses sides (its request 37932).
         gray = gray.Slice([0], height, [2], [2]).Slice([0], width, [3], [2])
         sigma = BASE_SIGMA_PX
     images, heights, widths = zip(*layers, strict=True)
