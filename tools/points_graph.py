@@ -84,7 +84,7 @@ OCTAVES, REACH = 3, 15
 """Octaves of SIFT's scale space, and radius of gradient windows, that the sizes of points need."""
 
 TOGETHER = 16
-"""Number of neighbours that a convolution reads at once, as channels of its input."""
+"""Number of neighbours that a convolution smooths at once, as its channels."""
 
 BLOCK = 256
 """Number of points that are compared with each other at once. Chosen by hand."""
@@ -301,28 +301,33 @@ def _framed(values: Any, radius: int, axis: int, side: Any, more: Any = 0) -> An
 def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
     """Smooth images as `cv2.GaussianBlur` does.
 
-    Convolutions with one channel are slow, so `TOGETHER` neighbours are channels of the input. They
-    are transposed convolutions, because OpenVINO would round the others to bfloat16.
+    Convolutions with one channel are slow, so `TOGETHER` neighbours are channels. The convolutions
+    are transposed, because OpenVINO would round others to bfloat16.
     """
     graph, radius = values.graph, round(2 * REACH_PER_SIGMA * sigma + 1) // 2
     kernel = cv2.getGaussianKernel(2 * radius + 1, float(sigma), cv2.CV_32F)[:, 0]
-    reach = TOGETHER - 1
-    places = graph.constant(np.arange(len(kernel) + reach)) - np.arange(-reach, 1)[:, None]
-    shifted = graph.constant(np.pad(kernel, reach)).Gather(places)  # small in a file
+    # The neighbours of a block of pixels lie in this block and the next `more`.
+    more = (2 * radius + TOGETHER - 1) // TOGETHER
+    numbers = np.arange(TOGETHER)
+    places = numbers[:, None, None] - numbers[:, None] + TOGETHER * np.arange(more, -1, -1)
+    beyond = TOGETHER * (more + 2) - 1 - len(kernel)
+    table = graph.constant(np.pad(kernel, (TOGETHER - 1, beyond)))  # small in a file
+    weights = table.Gather(graph.constant(places) + (TOGETHER - 1))
     for axis, side in ((3, width), (2, height)):
-        missing = ((side + 2 * radius) * -1).Mod([TOGETHER])
-        framed = _framed(values, radius, axis, side, missing)
-        # One side becomes blocks of `TOGETHER`, the channels: (B, TOGETHER, H, W).
+        missing = (side * -1).Mod([TOGETHER]) + (TOGETHER * more - 2 * radius)
+        blocks = _framed(values, radius, axis, side, missing)
+        # One side in blocks: to (B, TOGETHER, H, W) and back.
         if axis == 3:
-            blocks = framed.Squeeze([1]).Reshape([0, 0, -1, TOGETHER]).Transpose(perm=[0, 3, 1, 2])
-            shape, strides, crop = (1, -1), (1, TOGETHER), (0, 2 * radius)
+            blocks = blocks.Squeeze([1]).Reshape([0, 0, -1, TOGETHER]).Transpose(perm=[0, 3, 1, 2])
+            shape, crop, order, whole = (1, -1), [0, more], [0, 2, 3, 1], [0, 0, -1]
         else:
-            blocks = framed.Reshape(graph.join([[0, -1, TOGETHER], width], axis=0))
+            blocks = blocks.Reshape(graph.join([[0, -1, TOGETHER], width], axis=0))
             blocks = blocks.Transpose(perm=[0, 2, 1, 3])
-            shape, strides, crop = (-1, 1), (TOGETHER, 1), (2 * radius, 0)
-        weights = shifted.Reshape([TOGETHER, 1, *shape])
-        smooth = blocks.ConvTranspose(weights, strides=strides, pads=[*crop, 0, 0])
-        values = smooth.Slice([0], side, [axis])
+            shape, crop, order = (-1, 1), [more, 0], [0, 2, 1, 3]
+            whole = graph.join([[0, -1], width], axis=0)
+        kernels = weights.Reshape([TOGETHER, TOGETHER, *shape])
+        smooth = blocks.ConvTranspose(kernels, pads=crop * 2).Transpose(perm=order)
+        values = smooth.Reshape(whole).Unsqueeze([1]).Slice([0], side, [axis])
     return values
 
 
