@@ -309,10 +309,10 @@ def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
     # The neighbours of a block of pixels lie in this block and the next `more`.
     more = (2 * radius + TOGETHER - 1) // TOGETHER
     numbers = np.arange(TOGETHER)
-    places = numbers[:, None, None] - numbers[:, None] + TOGETHER * np.arange(more, -1, -1)
+    within = graph.constant(numbers[:, None, None] - numbers[:, None] + TOGETHER - 1)
     beyond = TOGETHER * (more + 2) - 1 - len(kernel)
     table = graph.constant(np.pad(kernel, (TOGETHER - 1, beyond)))  # small in a file
-    weights = table.Gather(graph.constant(places) + (TOGETHER - 1))
+    weights = table.Gather(within + TOGETHER * np.arange(more, -1, -1))
     for axis, side in ((3, width), (2, height)):
         missing = (side * -1).Mod([TOGETHER]) + (TOGETHER * more - 2 * radius)
         blocks = _framed(values, radius, axis, side, missing)
