@@ -6,6 +6,10 @@
 The first command writes the package's file that `deepdetect export onnx` adds to a network. The
 second one writes the file that the page in the browser runs. Steps, constants and weights are those
 of `deepdetect.detector.points`: after a change there, write the package's file again.
+
+On processors with bfloat16, OpenVINO computes convolutions and products of matrices in it, and all
+that they need; the rest before an output stays in float32. So the graph has neither, except for one
+product of zeros and ones.
 """
 
 from __future__ import annotations
@@ -80,7 +84,7 @@ OCTAVES, REACH = 3, 15
 """Octaves of SIFT's scale space, and radius of gradient windows, that the sizes of points need."""
 
 TOGETHER = 16
-"""Number of neighbours that a convolution smooths at once, as channels of its result."""
+"""Number of neighbours that a convolution smooths at once, as its channels."""
 
 BLOCK = 256
 """Number of points that are compared with each other at once. Chosen by hand."""
@@ -215,7 +219,7 @@ class Graph:
 
 def gray_of(image: Any) -> Any:
     """Convert (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) grey levels, equal to OpenCV's."""
-    gray = (image * 255.0).Round().Conv(np.reshape(LUMA, (1, 3, 1, 1)))
+    gray = ((image * 255.0).Round() * np.reshape(LUMA, (1, 3, 1, 1))).ReduceSum([1])
     return ((gray + LUMA_UNIT / 2) / LUMA_UNIT).Floor()
 
 
@@ -297,22 +301,33 @@ def _framed(values: Any, radius: int, axis: int, side: Any, more: Any = 0) -> An
 def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
     """Smooth images as `cv2.GaussianBlur` does.
 
-    Convolutions with one channel are slow, so `TOGETHER` neighbours are channels of the result.
+    Convolutions with one channel are slow, so `TOGETHER` neighbours are channels. The convolutions
+    are transposed, because OpenVINO would round others to bfloat16.
     """
     graph, radius = values.graph, round(2 * REACH_PER_SIGMA * sigma + 1) // 2
     kernel = cv2.getGaussianKernel(2 * radius + 1, float(sigma), cv2.CV_32F)[:, 0]
-    reach = TOGETHER - 1
-    places = graph.constant(np.arange(len(kernel) + reach)) - np.arange(-reach, 1)[:, None]
-    shifted = graph.constant(np.pad(kernel, reach)).Gather(places)  # small in a file
+    # The neighbours of a block of pixels lie in this block and the next `more`.
+    more = (2 * radius + TOGETHER - 1) // TOGETHER
+    numbers = np.arange(TOGETHER)
+    within = graph.constant(numbers[:, None, None] - numbers[:, None] + TOGETHER - 1)
+    beyond = TOGETHER * (more + 2) - 1 - len(kernel)
+    table = graph.constant(np.pad(kernel, (TOGETHER - 1, beyond)))  # small in a file
+    weights = table.Gather(within + TOGETHER * np.arange(more, -1, -1))
     for axis, side in ((3, width), (2, height)):
-        missing = (side * -1).Mod([TOGETHER])
-        shape, strides = [(-1, 1), (1, -1)][axis - 2], [(TOGETHER, 1), (1, TOGETHER)][axis - 2]
-        weights = shifted.Reshape([TOGETHER, 1, *shape])
-        parts = _framed(values, radius, axis, side, missing).Conv(weights, strides=strides)
-        # (B, TOGETHER, H, W) with one side of those: back into the row or column.
-        rows = parts.Transpose(perm=[0, 2, 3, 1] if axis == 3 else [0, 2, 1, 3])
-        whole = graph.join([[0, -1], side + missing if axis == 3 else width], axis=0)
-        values = rows.Reshape(whole).Unsqueeze([1]).Slice([0], side, [axis])
+        missing = (side * -1).Mod([TOGETHER]) + (TOGETHER * more - 2 * radius)
+        blocks = _framed(values, radius, axis, side, missing)
+        # One side in blocks: to (B, TOGETHER, H, W) and back.
+        if axis == 3:
+            blocks = blocks.Squeeze([1]).Reshape([0, 0, -1, TOGETHER]).Transpose(perm=[0, 3, 1, 2])
+            shape, crop, order, whole = (1, -1), [0, more], [0, 2, 3, 1], [0, 0, -1]
+        else:
+            blocks = blocks.Reshape(graph.join([[0, -1, TOGETHER], width], axis=0))
+            blocks = blocks.Transpose(perm=[0, 2, 1, 3])
+            shape, crop, order = (-1, 1), [more, 0], [0, 2, 1, 3]
+            whole = graph.join([[0, -1], width], axis=0)
+        kernels = weights.Reshape([TOGETHER, TOGETHER, *shape])
+        smooth = blocks.ConvTranspose(kernels, pads=crop * 2).Transpose(perm=order)
+        values = smooth.Reshape(whole).Unsqueeze([1]).Slice([0], side, [axis])
     return values
 
 
@@ -466,7 +481,9 @@ def _rank(graph: Graph, features: dict[tuple[int, ...], Any]) -> Any:
     values = values.Clip(-MAX_DEVIATIONS, MAX_DEVIATIONS)
     for k, (weight, bias) in enumerate(ranker.layers):
         values = values.Relu() if k else values
-        values = graph.tensor(weight if k else weight[:, order]).MatMul(values) + bias[:, None]
+        # A product of matrices, which OpenVINO would round to bfloat16 if it were written as one.
+        weight = (weight if k else weight[:, order]).T[:, :, None]
+        values = values.ConvTranspose(weight) + bias[:, None]
     return (values + features[0,]).Squeeze([1])
 
 
@@ -539,7 +556,9 @@ def directions(gray: Any, x: Any, y: Any, sizes: Any) -> Any:
                 gray, sigma = _blur(gray, (wanted**2 - sigma**2) ** 0.5, height, width), wanted
             if layer:
                 layers.append((gray.Flatten(), height, width))
-        gray, sigma = gray.Slice([0, 0], [END, END], [2, 3], [2, 2]), BASE_SIGMA_PX
+        # After a slice up to `END` by steps, OpenVINO 2026.4 confuses sides (its request 37932).
+        gray = gray.Slice([0], height, [2], [2]).Slice([0], width, [3], [2])
+        sigma = BASE_SIGMA_PX
     images, heights, widths = zip(*layers, strict=True)
     flat, heights, widths = (
         graph.join(each, axis=axis) for each, axis in ((images, 1), (heights, 0), (widths, 0))

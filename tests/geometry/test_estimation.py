@@ -108,6 +108,47 @@ def test_finds_the_model_among_outliers(model: str) -> None:
     assert np.median(errors_of(fresh.points0, fresh.points1, model, geometry.matrix)) < 0.3
 
 
+def small_region(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return 15 to 25 right matches of a region of 40 pixels, with some depth."""
+    rng = np.random.default_rng(seed)
+    points0 = rng.uniform((100, 100), (540, 380)) + rng.uniform(-20, 20, (15 + seed % 11, 2))
+    homogeneous = np.column_stack([points0, np.ones(len(points0))])
+    rays = homogeneous @ np.linalg.inv(CAMERA0).T * rng.uniform(4, 4.3, (len(points0), 1))
+    points1 = (rays @ TURN.T + SHIFT) @ CAMERA1.T
+    points1 = points1[:, :2] / points1[:, 2:]
+    return tuple(points + rng.normal(0, 0.3, points.shape) for points in (points0, points1))
+
+
+@every_way
+def test_ordinary_matches_of_a_small_region_have_a_geometry(model: str) -> None:
+    """OpenCV raises an error for the fundamental matrix of about 3 of these sets."""
+    options = make_options(model)
+    found = [estimate_geometry(*small_region(seed), **options) for seed in range(300)]
+    assert all(geometry.matrix is not None for geometry in found)
+
+
+@every_way
+def test_an_error_of_opencv_is_no_answer(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It raises one in the first two orders of the matches."""
+    kind = {"homography": "Homography", "fundamental": "FundamentalMat"}.get(model, "EssentialMat")
+    scene, calls, find = make_scene(model), [], getattr(cv2, f"find{kind}")
+
+    def raising(first: np.ndarray, *rest: Any, **more: Any) -> Any:
+        calls.append(first.copy())
+        if len(calls) <= 2:
+            raise cv2.error("assertion failed")
+        return find(first, *rest, **more)
+
+    monkeypatch.setattr(cv2, f"find{kind}", raising)
+    geometry = estimate_geometry(scene.points0, scene.points1, **make_options(model))
+    assert geometry.inliers[scene.true].mean() > 0.9
+    first, second, third = calls
+    assert (first != second).any()
+    assert (second != third).any()
+    for each in calls:
+        np.testing.assert_array_equal(np.sort(each, axis=0), np.sort(first, axis=0))
+
+
 @every_way
 def test_the_same_seed_gives_the_same_result(model: str) -> None:
     scene = make_scene(model)

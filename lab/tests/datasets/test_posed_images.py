@@ -192,6 +192,45 @@ def test_a_simple_pinhole_has_one_focal_length(tmp_path: Path) -> None:
     np.testing.assert_allclose(load(folder).images[0].intrinsics, expected)
 
 
+SIMPLE, DOUBLE = "50 30.5 20.5", "50 52 31.75 19"
+UNDISTORTED = {
+    "SIMPLE_RADIAL": f"{SIMPLE} 0",
+    "RADIAL": f"{SIMPLE} 0 0",
+    "OPENCV": f"{DOUBLE} 0 0 0 0",
+    "FULL_OPENCV": f"{DOUBLE} 0 0 0 0 0 0 0 0",
+    "RADIAL printed with few digits": f"{SIMPLE} 1e-9 -1e-10",
+}
+NO_PINHOLES = {
+    "SIMPLE_RADIAL": f"{SIMPLE} 0.01",
+    "OPENCV": f"{DOUBLE} 0 0 0.001 0",
+    "FULL_OPENCV": f"{DOUBLE} 0 0 0 0 0 0 0 0.1",
+    "FOV": f"{DOUBLE} 0.5",
+    "SIMPLE_RADIAL_FISHEYE": f"{SIMPLE} 0",
+    "RADIAL_FISHEYE": f"{SIMPLE} 0 0",
+    "OPENCV_FISHEYE": f"{DOUBLE} 0 0 0 0",
+    "THIN_PRISM_FISHEYE": f"{DOUBLE} 0 0 0 0 0 0 0 0",
+}
+
+
+@pytest.mark.parametrize("case", UNDISTORTED)
+def test_lens_models_without_distortion_are_pinholes(case: str, tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path, ".", ".")
+    model, numbers = case.split()[0], UNDISTORTED[case]
+    (folder / "cameras.txt").write_text(f"7 {model} 60 40 {numbers}\n")
+    simple = numbers.startswith(SIMPLE)
+    fy, cx, cy = (50, 30.0, 20.0) if simple else (52, 31.25, 18.5)
+    expected = [[50, 0, cx], [0, fy, cy], [0, 0, 1]]
+    np.testing.assert_allclose(load(folder).images[0].intrinsics, expected)
+
+
+@pytest.mark.parametrize("model", NO_PINHOLES)
+def test_distortion_and_fisheyes_are_refused(model: str, tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path, ".", ".")
+    (folder / "cameras.txt").write_text(f"7 {model} 60 40 {NO_PINHOLES[model]}\n")
+    with pytest.raises(ImageError, match=model):
+        load(folder)
+
+
 def test_scenes_are_the_folder_or_its_subfolders(tmp_path: Path) -> None:
     for name, write in WRITERS.items():
         write(tmp_path / name)

@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
-from .._shared.opencv import cv2
 from .camera import Calibration, Camera, Size, cross_matrix
-from .estimation import TwoViewModel, fit_essential, log10_nfa
+from .estimation import TwoViewModel, fit_essential, fit_shuffled, log10_nfa
 from .relative_pose import Pose, best_of_four, moved_pose
 from .transforms import epipolar_errors, signed_epipolar_errors
 
@@ -86,12 +85,11 @@ def estimate_semi_calibrated(
         alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
         return TwoViewModel("fundamental", fundamental, inliers, alarms)
 
-    # OpenCV always draws the same samples; shuffled matches make them depend on the seed.
-    order = np.random.default_rng(seed).permutation(len(points0))
     best = start = None
     for focal in FOCAL_LENGTHS:
         cameras = _Cameras.guess(sizes, focal)
-        essential = _fit_essential(points0[order], points1[order], cameras, inlier_threshold)
+        fit = partial(_fit_essential, cameras=cameras, inlier_threshold=inlier_threshold)
+        essential = fit_shuffled(fit, points0, points1, seed)
         if essential is None:
             continue
         fundamental = cameras.fundamental(essential)
@@ -221,20 +219,14 @@ def _fit_essential(
 ) -> np.ndarray | None:
     calibration = cameras.calibration
     camera0, camera1 = calibration.camera0, calibration.camera1
-    try:
-        matrix = fit_essential(
-            camera0.rays(points0),
-            camera1.rays(points1),
-            (camera0.focal_px[0] + camera1.focal_px[0]) / 2,
-            inlier_threshold,
-            CONFIDENCE,
-            ITERATIONS,
-        )
-    except cv2.error:  # degenerate input, such as coinciding points
-        return None
-    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        return None
-    return np.asarray(matrix)
+    return fit_essential(
+        camera0.rays(points0),
+        camera1.rays(points1),
+        (camera0.focal_px[0] + camera1.focal_px[0]) / 2,
+        inlier_threshold,
+        CONFIDENCE,
+        ITERATIONS,
+    )
 
 
 def _fit(views: Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> Views:

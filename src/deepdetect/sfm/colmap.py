@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,9 @@ PIXEL_CENTRE = 0.5
 """COLMAP has the centre of the first pixel at (0.5, 0.5), this package at (0, 0)."""
 
 SIFT_NUMBERS = 128
+
+CENTRE_TOLERANCE_PX = 1e-6
+"""A principal point this close to the middle, in pixels, is in the middle up to rounding errors."""
 
 ROWS = 256
 """An image is undistorted in strips of this number of rows, which limits the memory needed."""
@@ -134,13 +137,30 @@ class CameraIntrinsics:
         cropped = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self.colmap_camera())
         return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
 
+    @property
+    def centred(self) -> CameraIntrinsics:
+        """`without_border`, cropped around the principal point, which then is in the middle.
+
+        Raises a ReconstructionError if the principal point lies outside the image.
+        """
+        pinhole = self.without_border.pinhole
+        middle = np.add(pinhole.centre, PIXEL_CENTRE)
+        side = 2 * np.minimum(middle, np.subtract(pinhole.size, middle))
+        if side.min() < 1:
+            raise ReconstructionError(
+                f"the principal point {pinhole.centre} lies outside the image, so no crop has it "
+                "in the middle: correct the calibration, or leave out the format 'splat'"
+            )
+        camera = Camera(np.floor(side + CENTRE_TOLERANCE_PX).tolist(), pinhole.focal_px)
+        return replace(CameraIntrinsics.of_camera(camera), source=self.source)
+
     def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
         """Undistort an image, (H, W) or (H, W, 3), taken by this camera.
 
         The result is the image of the camera `pinhole` (default: `self.pinhole`). The given image
-        may be a scaled copy of the photograph.
+        may be a scaled copy of the photograph. Without distortion, only a crop changes it.
         """
-        if not self.distorts:
+        if not self.distorts and (pinhole is None or pinhole.size == image.shape[1::-1]):
             return image
         pinhole, camera = pinhole or self.pinhole, self.colmap_camera()
         ratio = np.divide(image.shape[1::-1], self.size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -84,12 +85,25 @@ def write_transforms(
 def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
     """Write splat/: undistorted images/, sparse/0, depths/ (16-bit PNG), and transforms.json.
 
+    The first program for Gaussian splatting takes the middle of an image for its principal point.
+    Therefore images are cropped, and a warning says so, unless it is there already.
+
     The model in sparse/0 has the sparse points with their tracks, and at most `SPLAT_POINTS` of the
     dense points, chosen evenly in space.
     """
     target = output / "splat"
-    cropped = {own: own.without_border for own in {*found.intrinsics.values()}}
-    intrinsics = {name: cropped[own] for name, own in found.intrinsics.items()}
+    centred = {own: own.centred for own in {*found.intrinsics.values()}}
+    lost = [np.subtract(own.without_border.size, new.size) for own, new in centred.items()]
+    across, down = np.max(lost, axis=0)
+    if across or down:
+        warnings.warn(
+            f"the images in {target.name}/ are cropped by up to {across} pixels in width and "
+            f"{down} in height, so that their principal points are in the middle, where the first "
+            "program for Gaussian splatting takes them to be",
+            UserWarning,
+            stacklevel=2,
+        )
+    intrinsics = {name: centred[own] for name, own in found.intrinsics.items()}
     views = {
         name: replace(view, camera=intrinsics[name].pinhole) for name, view in found.views.items()
     }

@@ -37,10 +37,14 @@ def planes_of(*images: np.ndarray) -> np.ndarray:
 
 def open_in(runtime: str, path: Path) -> Run:
     """Return what computes keypoints, scores, sizes and angles of images."""
-    if runtime == "openvino":
+    if runtime.startswith("openvino"):
         openvino = pytest.importorskip("openvino", reason="needs OpenVINO")
-        settings = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1}
-        model = openvino.Core().compile_model(str(path), "CPU", settings)
+        core, settings = openvino.Core(), {"INFERENCE_NUM_THREADS": 1}
+        if runtime == "openvino":
+            settings["INFERENCE_PRECISION_HINT"] = "f32"
+        elif "BF16" not in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+            pytest.skip("needs a processor with bfloat16")
+        model = core.compile_model(str(path), "CPU", settings)
 
         def run(images: np.ndarray) -> list[np.ndarray]:
             found = model([images])
@@ -62,7 +66,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-@pytest.fixture(scope="module", params=["onnxruntime", "openvino"])
+@pytest.fixture(scope="module", params=["onnxruntime", "openvino", "openvino in bfloat16"])
 def run(request: pytest.FixtureRequest, path: Path) -> Run:
     return open_in(request.param, path)
 
@@ -118,6 +122,15 @@ def test_the_smallest_images_have_none(shape: tuple[int, int], run: Run) -> None
     xy, scores, *_ = run(image)
     assert scores.max() == 0
     assert xy.max() == -1
+
+
+@pytest.mark.parametrize("size", [None, (123, 157)])
+def test_points_beside_maps_are_right_in_bfloat16(
+    size: tuple[int, int] | None, tmp_path: Path, photo: np.ndarray
+) -> None:
+    made, rgb = tmp_path / "both.onnx", photo[:123, :157]
+    write_onnx("default", made, OnnxOptions(size, max_keypoints=300))
+    assert share(open_in("openvino in bfloat16", made)(planes_of(rgb)), 0, rgb, 300) > 0.98
 
 
 def test_one_size_with_maps(tmp_path: Path, photo: np.ndarray) -> None:

@@ -5,7 +5,8 @@
   poses.txt. The first line of calib.txt holds the projection matrix of the camera. K.txt holds its
   camera matrix. Line 1 of poses.txt belongs to image 000000.
 - COLMAP (Schönberger and Frahm, 2016): a text or binary model without distortion in the folder, in
-  sparse/ or in sparse/0/, and images in the folder or in images/. pycolmap reads the model.
+  sparse/ or in sparse/0/, and images in the folder or in images/. pycolmap reads the model. After
+  undistortion cameras may keep the name of a lens model, such as OPENCV, with coefficients of 0.
 
 Intrinsics are in pixels of the image files. They are scaled if they are given for another size.
 """
@@ -15,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -255,10 +257,10 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
                 f"there is no image {image.name} in {folder} or its folder images: put it there"
             )
         camera, pose = image.camera, image.cam_from_world()
-        if camera.model_name not in ("SIMPLE_PINHOLE", "PINHOLE"):
+        if not _is_pinhole(camera):
             raise ImageError(
-                f"a camera in {place} has the model {camera.model_name}, not PINHOLE: undistort "
-                "the images first (colmap image_undistorter)"
+                f"a camera in {place} is no pinhole camera, but has the model {camera.model_name}: "
+                "undistort the images to PINHOLE first (colmap image_undistorter)"
             )
         # In COLMAP, the centre of the first pixel is (0.5, 0.5).
         matrix = camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
@@ -266,6 +268,17 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
         rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
         images.append(_posed_image(paths[0], matrix, rotation, translation, place))
     return sorted(images, key=lambda image: image.path)
+
+
+def _is_pinhole(camera: Any) -> bool:
+    """Whether a `pycolmap.Camera` sees the border of its image as a pinhole camera does."""
+    if not camera.focal_length_idxs():  # a panorama
+        return False
+    size = np.array([camera.width, camera.height])
+    pixels = np.array([(x, y, 1) for x in (0, size[0] / 2, size[0]) for y in (0, size[1])])
+    rays = pixels @ np.linalg.inv(camera.calibration_matrix()).T
+    moved = (np.asarray(camera.img_from_cam(rays)) - pixels[:, :2]) / size
+    return bool((np.abs(moved) < np.finfo(np.float32).eps).all())
 
 
 def _read_located(folder: Path) -> list[PosedImage]:

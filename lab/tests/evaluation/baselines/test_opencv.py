@@ -39,7 +39,7 @@ def low_fast() -> cv2.FastFeatureDetector:
 
 # SIFT: number, layers, contrast, edge, sigma.  BRISK: threshold, octaves.
 DETECTORS: dict[str, Callable[[], cv2.Feature2D]] = {
-    "sift": cv2.SIFT_create,
+    "sift": lambda: cv2.SIFT_create(enable_precise_upscale=True),
     "sift-low": lambda: cv2.SIFT_create(0, 4, 1e-9, 100, 0.7),
     "orb": cv2.ORB_create,
     "orb-low": low_orb,
@@ -81,6 +81,21 @@ def test_own_descriptors_equal_those_of_one_call(crop: np.ndarray, name: str) ->
     assert described.dtype == expected.dtype
     np.testing.assert_array_equal(found.xy, np.array([p.pt for p in points], np.float32))
     np.testing.assert_array_equal(described, expected)
+
+
+def test_sift_finds_spots_where_they_are() -> None:
+    """OpenCV's default finds them a quarter of a pixel to the right and below."""
+    y, x = np.indices((160, 160))
+    centres = np.random.default_rng(0).uniform(-0.5, 0.5, (16, 2)) + np.array(
+        [(20 + 40 * k, 20 + 40 * j) for k in range(4) for j in range(4)]
+    )
+    light = sum(np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * 2.5**2)) for cx, cy in centres)
+    rgb = np.repeat(np.rint(30 + 180 * light).astype(np.uint8)[..., None], 3, axis=2)
+    found = CLASSICAL["sift"].detect(rgb).xy
+    offsets = found[:, None] - centres
+    nearest = offsets[np.linalg.norm(offsets, axis=2).argmin(axis=0), np.arange(16)]
+    assert np.abs(nearest).max() < 0.2
+    assert np.abs(nearest.mean(axis=0)).max() < 0.05
 
 
 @pytest.mark.parametrize("name", ["fast", "agast-low", "sift-low"])

@@ -1,4 +1,7 @@
-"""OpenCV's classical detectors, with default settings and with the low thresholds of the paper."""
+"""OpenCV's classical detectors, with default settings and with the low thresholds of the paper.
+
+SIFT differs from OpenCV's default: it upscales precisely.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,8 @@ AGAST_7_12D = 1
 
 OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
     # SIFT: Lowe 2004. ORB: Rublee et al. 2011. BRISK: Leutenegger et al. 2011.
-    "sift": ("SIFT", "SIFT_create", {}),
+    # Without precise upscaling, OpenCV shifts positions by a quarter of a pixel.
+    "sift": ("SIFT", "SIFT_create", {"enable_precise_upscale": True}),
     "sift-low": (
         "SIFT, low settings",
         "SIFT_create",
@@ -74,10 +78,14 @@ def describe_with(descriptor: cv2.Feature2D, rgb: np.ndarray, features: Keypoint
 
 
 def _feature(
-    name: str, title: str, detect: Callable[[np.ndarray], Keypoints], descriptor: str
+    name: str,
+    title: str,
+    detect: Callable[[np.ndarray], Keypoints],
+    descriptor: str,
+    settings: Mapping[str, Any] = {},
 ) -> LocalFeature:
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        return describe_with(opencv_factory(descriptor)(), rgb, features)
+        return describe_with(opencv_factory(descriptor)(**settings), rgb, features)
 
     return LocalFeature(name, title, detect, describe, binary=descriptor != "SIFT_create")
 
@@ -87,7 +95,10 @@ def _opencv(name: str) -> LocalFeature:
         found = _make(name).detect(luma(rgb), None)
         return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
 
-    title, factory, _ = OPENCV_SETTINGS[name]
+    title, factory, settings = OPENCV_SETTINGS[name]
+    if name == "sift":  # upscales the image for both in the same way
+        feature = _feature(name, title, detect, factory, settings)
+        return replace(feature, version="2", detection="", own_scale=OwnScaleDescriptor())
     binary = factory in ("ORB_create", "BRISK_create")
     return _feature(name, title, detect, factory if binary else "SIFT_create")
 
@@ -161,7 +172,6 @@ def _corners(rgb: np.ndarray, corners: np.ndarray | None, scores: np.ndarray) ->
 
 CLASSICAL: dict[str, LocalFeature] = {
     **{name: _opencv(name) for name in OPENCV_SETTINGS if name != "orb-many"},
-    "sift": replace(_opencv("sift"), own_scale=OwnScaleDescriptor()),
     "harris": _harris("harris", "Harris", 2, 3, 0.04, 0.04),
     "harris-low": _harris("harris-low", "Harris, low settings", 3, 5, 0.001, 0.001),
     "shi-tomasi": _shi_tomasi("shi-tomasi", "Shi-Tomasi", 0.01, 0.04),

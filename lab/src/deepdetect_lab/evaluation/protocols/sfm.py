@@ -81,7 +81,11 @@ TEXT = (
     "and a last bundle adjustment has a robust loss. All methods have the same options. They run "
     "once with true and once with estimated intrinsics; true poses are only used for evaluation. "
     "Methods differ in the keypoints: the ranked points of DeepDetect; as many random points with "
-    "the same sizes; and SIFT of pycolmap, with its own matcher, at no more positions. SIFT runs "
+    "the same sizes; and SIFT of pycolmap, with its own matcher, where `max_num_features` is the "
+    "number of ranked points that are asked for. This does not limit SIFT: COLMAP takes whole "
+    "scales, the coarsest first, until there are enough, and some positions get several "
+    "orientations. It gave up to 1.8 times as many keypoints, at up to 1.5 times as many "
+    "positions, and the finest scales were missing; the second table has the numbers. SIFT runs "
     'once with and once without refinement of its tracks. "Dense tracks" uses the ranked points '
     "with the option `--matches dense`. If only the GPS positions of a scene are known, the camera "
     "centres are compared with them.",
@@ -317,7 +321,10 @@ def find_random_points(detector: PointDetector, stages: Stages, folder: Path) ->
 
 
 def find_sift(stages: Stages, folder: Path) -> None:
-    """Write keypoints of pycolmap's SIFT with its defaults, at up to `MAX_KEYPOINTS` positions."""
+    """Write keypoints of pycolmap's SIFT with its defaults: `MAX_KEYPOINTS` or some more.
+
+    COLMAP drops the finest scales as long as at least `max_num_features` keypoints are left.
+    """
     names = sorted(path.name for path in folder.iterdir())
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureExtractionOptions()
