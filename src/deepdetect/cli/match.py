@@ -25,7 +25,7 @@ from ..features.selection import SelectionOptions
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
-from ..io.image import load_image
+from ..io.image import load_image, load_visible, one_range
 from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_picture
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
@@ -119,17 +119,19 @@ def match(
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
     stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
-    load = lru_cache(2)(load_image)  # successive pairs share an image
+    load = lru_cache(2)(load_visible)  # successive pairs share an image
     found: list[dict[str, Any]] = []
     failures: list[str] = []
-    with progress(len(outputs), "matching", "pair", quiet=not many) as bar:
+    seen = [*dict.fromkeys(inputs)]
+    with one_range(seen), progress(len(outputs), "matching", "pair", quiet=not many) as bar:
         for pair, files in outputs.items():
             name = " ".join(map(str, pair)) if many else ""
             with noted_failures(name, failures):
                 with cli.writing(files, pair, overwrite) as made:
-                    rgb0, rgb1 = map(load, pair)
+                    (rgb0, mask0), (rgb1, mask1) = map(load, pair)
                     with stage_progress("matching", stages, quiet=many) as done:
                         settings = values | {"options": geometry, "progress": done}
+                        settings["ignore"] = (mask0, mask1)
                         matches = match_pair(rgb0, rgb1, chosen, selection=selection, **settings)
                     save_matches(matches, made["file"])
                     if pictures:
@@ -158,6 +160,7 @@ def _match_unguided(
     detector: DeepDetect | PointDetector,
     *,
     selection: SelectionOptions | None,
+    ignore: tuple[np.ndarray | None, np.ndarray | None],
     options: GeometryOptions,
     progress: Callable[[str], object],
     model: str = "auto",
@@ -167,7 +170,8 @@ def _match_unguided(
     timer = StageTimer(progress)
     with timer.stage("keypoints"):
         chosen = {} if selection is None else vars(selection)
-        features = [detector.extract(image, **chosen) for image in (image0, image1)]
+        images = zip((image0, image1), ignore, strict=True)
+        features = [detector.extract(image, ignore=mask, **chosen) for image, mask in images]
     with timer.stage("matching"):
         matches = match_features(*features, seed=seed, **values)
     with timer.stage("geometry"):
@@ -306,7 +310,9 @@ def register(
             if files[path].suffix == ".tif":
                 kept.write_tiff(bands, made[path])
             else:
-                rgb = found.warped if path == image1 else array_to_rgb(bands, deep=True)
+                every = (0, 65535) if bands.dtype == np.uint16 else None  # keeps their numbers
+                rgb = array_to_rgb(bands, value_range=every, deep=True)
+                rgb = found.warped if path == image1 else rgb
                 save_picture(rgb, made[path], kept)
             kept.write_beside(files[path])
         save_picture(found.checkerboard(), made["_checkerboard.png"])

@@ -21,7 +21,7 @@ from ..features.selection import (
     select_keypoints,
 )
 from ..features.sift import describe_keypoints
-from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
+from ..io.image import Images, image_named, load_each, load_image, load_visible, luma
 from .backends import RuntimeOptions, open_network
 from .heatmap import HeatmapOptions, compute_maps, memory_named
 from .pretrained import PRETRAINED, resolve_weights
@@ -251,7 +251,8 @@ class DeepDetect:
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        return self._select(load_image(image, channels=channels), options, ignore)
+        rgb, ignore = load_visible(image, channels, ignore)
+        return self._select(rgb, options, ignore)
 
     @suggest_keywords
     def detect_batch(
@@ -281,10 +282,10 @@ class DeepDetect:
             OptionError: an option is out of its range, or a mask has another size than its image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        masks, found = ignore_masks(ignore, batch_length(images)), []
-        for number, rgb in load_each(images, channels):
+        found = []
+        for number, rgb, mask in load_each(images, channels, ignore):
             with image_named(number):
-                found.append(self._select(rgb, options, masks[number]))
+                found.append(self._select(rgb, options, mask))
         return found
 
     @suggest_keywords
@@ -314,7 +315,7 @@ class DeepDetect:
             ImageError: the image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
-        rgb = load_image(image, channels=channels)
+        rgb, ignore = load_visible(image, channels, ignore)
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
         return describe_keypoints(luma(rgb), self._select(rgb, options, ignore))
 

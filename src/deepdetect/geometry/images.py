@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._shared.alpha import continued
 from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
@@ -59,6 +60,18 @@ def warp_to_reference(
     whole = np.full(image1.shape[:2], 255, np.uint8)
     nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
     return warped, cv2.warpPerspective(whole, homography, size, flags=nearest) > 0
+
+
+def warp_visible(
+    pixels: np.ndarray, homography: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Warp RGB pixels as `warp_to_reference` does; transparent ones, as in `alpha`, are black."""
+    warped, valid = warp_to_reference(continued(pixels), homography, size)
+    if pixels.shape[2] == 4:
+        top = np.iinfo(pixels.dtype).max
+        valid &= warped[:, :, 3] >= top * (1 - MAX_UNKNOWN_WEIGHT)
+        warped = np.where(valid[:, :, None], warped[:, :, :3], 0).astype(pixels.dtype)
+    return warped, valid
 
 
 def warp_bands(

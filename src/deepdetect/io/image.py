@@ -6,18 +6,24 @@ Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
-from .._shared.errors import ImageError, MissingImageError, OptionError
-from .._shared.image_array import Channels, array_to_rgb, check_channels, deep_values
+from .._shared.errors import DeepDetectError, ImageError, MissingImageError, OptionError
+from .._shared.alpha import hidden_pixels, joined, on_grey
+from .._shared.image_array import Channels, array_to_pixels, check_channels, deep_values
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import was_made
+from .._shared.value_range import RangeOfCall, ValueRange, range_of_call
+from ..features.selection import check_ignore
 from .image_file import (
     IMAGE_SUFFIXES,
     RAW_SUFFIXES,
@@ -27,6 +33,7 @@ from .image_file import (
     is_file,
     open_file,
     open_image,
+    read_with,
     reading_options,
 )
 from .tiff import TIFF_STARTS, read_tiff
@@ -34,8 +41,16 @@ from .tiff import TIFF_STARTS, read_tiff
 Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
 
+T = TypeVar("T")
+
 MINIMUM_SIDE = 16
 """Images must be at least this many pixels wide and high. Chosen by hand."""
+
+SEEN_IMAGES = 8
+"""The common range of many deep images is found from this many, because reading all would take
+twice the time. Chosen by hand."""
+
+ALL_VALUES = (0, 65535)
 
 ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26
@@ -74,8 +89,9 @@ def load_image(
         image: a path; the content of an image file as bytes, or a file opened in binary mode,
             which is read from its beginning; a PIL image; or an array or a PyTorch tensor
             (H, W), (H, W, C) or (C, H, W) of 1, 3 or 4 channels: uint8, uint16 or float in [0, 1].
-            The fourth channel, alpha, is dropped. Files, also given as bytes, are turned upright
-            according to their EXIF orientation.
+            Files, also given as bytes, are turned upright according to their EXIF orientation.
+            Transparent pixels (alpha, a transparent palette entry, GDAL's no-data value or mask,
+            NaN in a TIFF file) are blended with grey, and hold no keypoints in any method.
         channels: order of the colours in an array or a tensor: "bgr" for images of `cv2.imread`
             and `cv2.VideoCapture`. It does not apply to files and PIL images.
         max_megapixels: size limit of image files: larger ones are rejected before decoding, since
@@ -84,7 +100,10 @@ def load_image(
             WebP files of at most 178 megapixels (`PIL.Image.MAX_IMAGE_PIXELS`).
         value_range: the values of black and of white, such as (0, 4095) for a 12-bit sensor. None:
             the values that the file states. If it states none, they are 0 and 1 for floats, and for
-            uint16 0 and the smallest of 255, 1023, 4095, 16383 and 65535 that no pixel exceeds.
+            uint16 0 and the smallest of 255, 1023, 4095, 16383 and 65535 that no pixel exceeds,
+            without hot pixels (at most one in a thousand) and padding with 65535. A narrow band
+            of uint16 values far from 0, as of a thermal camera, is spread over the grey levels,
+            with a warning. Methods that take several images read them with one common range.
             Integers that are neither uint8 nor uint16 need this option.
         bands: numbers, from 1, of the three bands of a TIFF file or array that become red, green
             and blue: (4, 3, 2) for Landsat 8. None: the first three. Images of four bands without
@@ -116,15 +135,82 @@ def load_image(
         page=page,
         allow_truncated=allow_truncated,
     )
-    return _load(image, channels, options, value_range=value_range, bands=bands)
+    pixels = _load(image, channels, options, value_range=value_range, bands=bands)
+    return np.ascontiguousarray(pixels[:, :, :3])
+
+
+def load_visible(
+    image: Any, channels: Channels = "rgb", ignore: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read an image like `load_image`; also return where it shows nothing that may be matched.
+
+    That is (H, W) bool, true where pixels are transparent or the mask `ignore` is true, or None.
+    """
+    pixels = _load(image, channels, reading_options())
+    hidden = hidden_pixels(pixels)
+    if hidden is not None:
+        if ignore is not None:
+            hidden = joined(hidden, check_ignore(ignore, hidden.shape))
+        return np.ascontiguousarray(pixels[:, :, :3]), hidden
+    return pixels, ignore
 
 
 def load_deep(image: Any, channels: Channels, *, raw: bool = False) -> np.ndarray:
     """Read an image like `load_image`, but as uint16 if it has more than 8 bits per channel.
 
-    If `raw`, arrays and TIFF files keep all their bands, (H, W, C), in their own data type.
+    The result has a fourth channel if pixels are transparent, as `alpha` defines it. If `raw`,
+    arrays and files keep all their bands, (H, W, C), and numbers, in their own data type.
     """
     return _load(image, channels, reading_options(), deep=True, raw=raw)
+
+
+def read_in_one_range(read: Callable[[], T]) -> tuple[T, ValueRange | None]:
+    """Return what `read` returns, which loads all images of a call, and their common range.
+
+    The range is None if no image is deep, or all state their ranges. If the images alone would
+    have other ranges, `read` is called twice.
+    """
+    call = RangeOfCall(reading_options().deep_range)
+    with range_of_call(call):
+        found = read()
+        if call.settle():
+            found = read()
+    return found, call.fixed
+
+
+def load_pair(
+    images: tuple[Any, Any], channels: Channels = "rgb", ignore: Any = None
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray | None, np.ndarray | None]]:
+    """Load two images with one range; return both images, and both masks of `load_visible`."""
+    masks = ignore_masks(ignore, 2)
+    read = partial(load_visible, channels=channels)
+    (first, second), _ = read_in_one_range(
+        lambda: [read(image, ignore=mask) for image, mask in zip(images, masks, strict=True)]
+    )
+    return (first[0], second[0]), (first[1], second[1])
+
+
+@contextmanager
+def one_range(images: Sequence[Any], channels: Channels = "rgb") -> Iterator[ReadingOptions]:
+    """Read the deep images of a call with one range in the block, that of all that are seen first.
+
+    These are all images, or `SEEN_IMAGES` of a longer list, at equal steps, if the first is deep.
+    Yields the options, which hold the range, for other processes.
+    """
+    options = reading_options()
+    if options.deep_range is None and options.value_range is None and len(images) > 1:
+        call = RangeOfCall()
+        step = -(-len(images) // SEEN_IMAGES)
+        for image in images[::step]:
+            with suppress(DeepDetectError), range_of_call(call), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                _load(image, channels, options)
+            if not call.used:
+                break
+        call.settle()
+        options = replace(options, deep_range=call.fixed)
+    with read_with(options):
+        yield options
 
 
 def _load(
@@ -136,16 +222,20 @@ def _load(
     raw: bool = False,
     **for_arrays: Any,  # options of this call; those of a command do not apply to arrays
 ) -> np.ndarray:
+    if options.deep_range is not None:
+        with range_of_call(RangeOfCall(options.deep_range)):
+            options = replace(options, deep_range=None)
+            return _load(image, channels, options, deep=deep, raw=raw, **for_arrays)
     if is_file(image):
         rgb = _read_file(image, options, deep, raw)
     elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
         if for_arrays.get("bands") is not None:
             raise OptionError("`bands` need a TIFF file or an array: leave them out")
-        rgb = _from_pil(image, "the image", for_arrays.get("value_range"), deep)
+        rgb = _from_pil(image, "the image", for_arrays.get("value_range"), deep, raw)
     elif raw and isinstance(image, np.ndarray) and image.ndim in (2, 3):
         rgb = image.reshape(*image.shape[:2], -1)
     else:
-        rgb = array_to_rgb(image, channels, deep=deep, **for_arrays)
+        rgb = array_to_pixels(image, channels, deep=deep, **for_arrays)
     height, width = rgb.shape[:2]
     if min(height, width) < MINIMUM_SIDE:
         raise ImageError(
@@ -155,14 +245,21 @@ def _load(
     return rgb
 
 
-def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
-    """Load the images of a list, tuple or batch one by one; yield the index and pixels of each."""
-    batch_length(images)
+def load_each(
+    images: Images, channels: Channels, ignore: Any = None
+) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
+    """Load the images of a list, tuple or batch one by one, with one range.
+
+    Yields the index and the results of `load_visible` of each. `ignore` is one mask or a list.
+    """
+    masks = ignore_masks(ignore, batch_length(images))
+    with one_range(images, channels) as reading:
+        pass
     for number, image in enumerate(images):
-        with image_named(number):
-            rgb = load_image(image, channels=channels)
-        yield number, rgb
-        del rgb
+        with image_named(number), read_with(reading):
+            loaded = load_visible(image, channels, masks[number])
+        yield number, *loaded
+        del loaded
 
 
 def batch_length(images: Images) -> int:
@@ -274,21 +371,24 @@ def _read_file(
         else:
             with open_image(file, options=options) as image:
                 if image.format == "PNG" and start[24] == 16 and start[25] != GREY_PNG:
-                    rgb = _deep_png(file, name, options, deep)
+                    rgb = _deep_png(file, name, options, deep, raw)
                 else:
-                    rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
+                    rgb = _from_pil(image, name, options.value_range, deep, raw)
                 orientation = orientation_of(image)
             del image  # frees its pixels before `UPRIGHT` makes another copy
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 
-def _deep_png(file: BinaryIO, name: str, options: ReadingOptions, deep: bool) -> np.ndarray:
+def _deep_png(
+    file: BinaryIO, name: str, options: ReadingOptions, deep: bool, raw: bool
+) -> np.ndarray:
     """Read a PNG file with several channels of 16 bits, which Pillow would reduce to 8."""
     file.seek(0)
     values = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise damaged_image(name, "it cannot be decoded")
-    return array_to_rgb(values, "bgr", name, value_range=options.value_range, deep=deep)
+    value_range = ALL_VALUES if raw else options.value_range
+    return array_to_pixels(values, "bgr", name, value_range=value_range, deep=deep)
 
 
 def orientation_of(image: Any) -> Any:
@@ -304,6 +404,7 @@ def _from_pil(
     name: str,
     value_range: tuple[float, float] | None = None,
     deep: bool = False,
+    raw: bool = False,
 ) -> np.ndarray:
     try:
         image.load()
@@ -312,7 +413,11 @@ def _from_pil(
     if image.mode.startswith(("I", "F")):
         values = deep_values(image)
         white = 65535 if image.format == "PPM" else None  # Pillow scales white to this in PPM
-        return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
+        if raw and values.dtype == np.uint16:
+            value_range = ALL_VALUES
+        rgb = array_to_pixels(values, name=name, value_range=value_range, white=white, deep=deep)
+        clear = image.info.get("transparency")
+        return rgb if clear is None else on_grey(rgb, values != clear, 1, name)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
     rows = max(1, STRIP_PIXELS // max(1, width))
@@ -320,7 +425,19 @@ def _from_pil(
         bottom = min(top + rows, height)
         strip = image if rows >= height else image.crop((0, top, width, bottom))
         rgb[top:bottom] = _strip_to_rgb(strip)
-    return rgb if value_range is None else array_to_rgb(rgb, name=name, value_range=value_range)
+    if value_range is not None:
+        rgb = array_to_pixels(rgb, name=name, value_range=value_range)
+    alpha = _alpha_of(image)
+    return rgb if alpha is None else on_grey(rgb, alpha, 255, name)
+
+
+def _alpha_of(image: Any) -> np.ndarray | None:
+    """Return the alpha of a loaded PIL image of 8 bits, (H, W) uint8, or None if it has none."""
+    if image.mode in ("RGBa", "La"):
+        image = image.convert(image.mode.upper())
+    elif "transparency" in image.info and image.mode in ("1", "L", "P", "RGB"):
+        image = image.convert("RGBA")
+    return np.asarray(image.getchannel("A")) if "A" in image.getbands() else None
 
 
 def _strip_to_rgb(image: Any) -> np.ndarray:

@@ -86,13 +86,17 @@ HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
 @suggest_keywords
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How image files are read; the fields are parameters of `load_image`."""
+    """How image files are read; the fields are parameters of `load_image`, but for the last.
+
+    `deep_range` is the range of uint16 images that state none, common to the images of a call.
+    """
 
     max_megapixels: float = MAX_MEGAPIXELS
     value_range: tuple[float, float] | None = None
     bands: tuple[int, int, int] | None = None
     page: int | None = None
     allow_truncated: bool = False
+    deep_range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not (isinstance(self.max_megapixels, Real) and self.max_megapixels > 0):

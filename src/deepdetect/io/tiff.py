@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from .._shared.errors import ImageError, MissingExtraError
-from .._shared.image_array import array_to_rgb
+from .._shared.alpha import on_grey
+from .._shared.image_array import array_to_pixels
 from .image_file import ReadingOptions, damaged_image, develop, identify
 
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -30,6 +31,9 @@ JPEG = (6, 7)
 ALPHA = (1, 2)
 """Types of extra samples that are alpha and not a band."""
 
+ASSOCIATED = 1
+"""The type of alpha by which the colours are multiplied already."""
+
 ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
@@ -43,9 +47,9 @@ def read_tiff(
     """Read an image of a TIFF file.
 
     Returns:
-        (H, W, 3) RGB, not yet turned upright, and the EXIF orientation. RGB is uint8, or uint16 if
-        `deep` and the file has more than 8 bits per value. If `raw`, all bands of a grey or RGB
-        file are returned instead, (H, W, C), in their own data type.
+        (H, W, 3) RGB, or (H, W, 4) as in `alpha`, not yet turned upright, and the EXIF orientation.
+        RGB is uint8, or uint16 if `deep` and the file has more than 8 bits per value. If `raw`, all
+        bands of a grey or RGB file are returned instead, (H, W, C), in their own data type.
 
     Raises:
         ImageError: as in `load_image`.
@@ -84,7 +88,11 @@ def read_tiff(
         orientation = int(page.tags.valueof(ORIENTATION, 1))
         if raw and photometric in (MIN_IS_BLACK, RGB):
             return bands, orientation
-        return _to_rgb(bands, page, name, options, deep), orientation
+        pixels = _to_pixels(bands, page, name, options, deep)
+        masks = [each for each in stored if each.is_mask and each.shape[:2] == page.shape[:2]]
+        if masks and photometric != PALETTE and pixels.shape[2] == 3:
+            pixels = on_grey(pixels, masks[0].asarray() != 0, 1, name)
+        return pixels, orientation
 
 
 def chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
@@ -119,15 +127,17 @@ def _checked_kind(page: Any, name: str) -> int:
     return photometric
 
 
-def _to_rgb(
+def _to_pixels(
     bands: np.ndarray, page: Any, name: str, options: ReadingOptions, deep: bool
 ) -> np.ndarray:
-    """Convert (H, W, bands) values to RGB as the tags of their page define."""
+    """Convert (H, W, bands) values to RGB, or RGB and alpha, as the tags of their page define."""
     photometric = int(page.photometric)
     chosen = _chosen_bands(bands, page, name, options)
-    value, absent = no_data_of(page), None
-    if value:  # pixels with the value 0 are black already
-        absent = (chosen == value) | (np.isnan(value) & np.isnan(chosen))
+    value = no_data_of(page)
+    absent = np.isnan(chosen) if chosen.dtype.kind == "f" else np.zeros(chosen.shape, bool)
+    if value is not None:
+        absent |= chosen == value
+    if absent.any():
         chosen = np.where(absent, chosen.dtype.type(0), chosen)
     if photometric == PALETTE:
         colours = page.colormap if page.colormap.max() < 256 else page.colormap >> 8
@@ -137,14 +147,19 @@ def _to_rgb(
 
         rgb = np.array(Image.fromarray(np.ascontiguousarray(chosen), "CMYK").convert("RGB"))
     else:
-        rgb = array_to_rgb(
+        rgb = array_to_pixels(
             chosen, name=name, value_range=options.value_range, white=_white(page), deep=deep
         )
     if photometric == MIN_IS_WHITE:
         rgb = ~rgb
-    if absent is not None:
-        rgb[absent.any(axis=2)] = 0
-    return rgb
+    known = ~absent.any(axis=2)
+    extra = [each in ALPHA for each in page.extrasamples]
+    if any(extra):  # the extra samples are the last ones
+        alpha = bands[:, :, extra.index(True) - len(extra)]
+        opaque = 255 if alpha.dtype == np.uint8 else max(alpha.max(), 1)
+        associated = ASSOCIATED in page.extrasamples
+        return on_grey(rgb, np.where(known, alpha, 0), opaque, name, associated=associated)
+    return on_grey(rgb, known, 1, name)
 
 
 def _chosen_bands(bands: np.ndarray, page: Any, name: str, options: ReadingOptions) -> np.ndarray:
@@ -201,5 +216,7 @@ def _read_by_pillow(
         image.seek(stored.index(page))
         image.load()
         if bits == 16:
-            return array_to_rgb(np.asarray(image), name=name, value_range=options.value_range)
-        return np.asarray(image.convert("RGB"))
+            return array_to_pixels(np.asarray(image), name=name, value_range=options.value_range)
+        rgb = np.asarray(image.convert("RGB"))
+        alpha = "A" in image.getbands()
+        return on_grey(rgb, np.asarray(image.getchannel("A")), 255, name) if alpha else rgb

@@ -29,7 +29,7 @@ from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import Images, ignore_masks, load_image, luma
+from ..io.image import Images, load_pair, luma
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 
@@ -110,8 +110,7 @@ def match_images(
         source = checked_positions(source)
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
-    masks = ignore_masks(ignore, 2)
-    rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
+    rgb, masks = load_pair((image0, image1), channels, ignore)
     grays = luma(rgb[0]), luma(rgb[1])
     timer = StageTimer(progress)
     find = [
@@ -122,12 +121,13 @@ def match_images(
     # they are found last, because they are not needed if no geometry can be trusted.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     settings = guiding, model, seed, options, keypoints_last, timer
-    matches = _match_guided(grays, (find[0], find[1]), source, *settings)
+    matches = _unmasked(_match_guided(grays, (find[0], find[1]), source, *settings), masks)
     if not (mutual and matches.success):
         return matches
     if source is not None:
         source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
     back = _match_guided(grays[::-1], (find[1], find[0]), source, *settings)
+    back = _unmasked(back, masks[::-1])
     return _found_both_ways(matches, back)
 
 
@@ -275,6 +275,17 @@ def _match_guided(
         matched.indices0,
         matched.indices1,  # type: ignore[arg-type]  # None: looked up later
     )
+
+
+def _unmasked(matches: Matches, masks: Sequence[np.ndarray | None]) -> Matches:
+    """Drop matches that end in a mask: the second image may show them where it has no keypoint."""
+    kept = np.ones(len(matches), bool)
+    for points, mask in zip((matches.points0, matches.points1), masks, strict=True):
+        if mask is not None:
+            limits = np.subtract(np.shape(mask)[::-1], 1)
+            columns, rows = np.rint(points).clip(0, limits).astype(np.intp).T
+            kept &= np.asarray(mask)[rows, columns] == 0
+    return matches if kept.all() else matches[kept]
 
 
 def _found_both_ways(matches: Matches, back: Matches) -> Matches:

@@ -9,19 +9,27 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from .._shared.errors import OptionError, RegistrationError, check_name
-from .._shared.image_array import Channels, to_8_bits
+from .._shared.image_array import Channels, from_16_bits, in_range, to_8_bits
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
+from .._shared.value_range import ValueRange
 from ..detector.detector import AnyDetector
 from ..features.selection import SelectionOptions
-from ..geometry.images import downscale, median_local_zncc, warp_bands, warp_to_reference
+from ..geometry.images import downscale, median_local_zncc, warp_bands, warp_visible
 from ..geometry.transforms import (
     outer_corners,
     scaled_homography,
     transform_points,
     translation_matrix,
 )
-from ..io.image import Images, load_deep, load_image, luma
+from ..io.image import (
+    Images,
+    ignore_masks,
+    load_deep,
+    load_visible,
+    luma,
+    read_in_one_range,
+)
 from ..io.image_file import file_name, is_file
 from ..io.picture_file import read_metadata
 from .pipeline import match_images
@@ -56,13 +64,15 @@ class Registration:
         first: (H, W, 3) uint8 RGB, the first image in the frame. With the extent "union" it is
             black outside its own area.
         warped: (H, W, 3) RGB, the second image warped into the frame, black where it has no
-            content. It is uint16 if the second image has more than 8 bits, otherwise uint8.
+            content. It is uint16 if the second image has more than 8 bits, otherwise uint8. Values
+            of uint16 images are those of the second image.
         valid: (H, W) bool, where the warped image has content.
         matches: number of dense matches that were kept.
         zncc: median local ZNCC of both images over their overlap, in [-1, 1].
         origin: (x, y) of the frame's first pixel in the first image; (0, 0) except for "union".
         applied: the images of `apply_to` warped into the frame, (H, W, C) with all their bands and
             in their own type. Where they have no content, they are 0, or their no-data value.
+        value_range: the values of black and white in `warped`, if it is uint16.
     """
 
     homography: np.ndarray
@@ -73,6 +83,7 @@ class Registration:
     zncc: float
     origin: tuple[int, int] = (0, 0)
     applied: tuple[np.ndarray, ...] = ()
+    value_range: ValueRange = (0, 65535)
 
     def __repr__(self) -> str:
         height, width = self.valid.shape
@@ -91,11 +102,16 @@ class Registration:
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
         second = self.valid & ((row + column) % 2 == 1)
-        return np.where(second[..., None], to_8_bits(self.warped), self.first)
+        return np.where(second[..., None], self._second, self.first)
 
     def difference(self) -> np.ndarray:
         """Return the absolute difference of both images, (H, W, 3) uint8; 0 outside the overlap."""
-        return np.where(self.valid[..., None], cv2.absdiff(self.first, to_8_bits(self.warped)), 0)
+        return np.where(self.valid[..., None], cv2.absdiff(self.first, self._second), 0)
+
+    @property
+    def _second(self) -> np.ndarray:
+        deep = self.warped.dtype == np.uint16
+        return in_range(self.warped, self.value_range) if deep else self.warped
 
 
 @suggest_keywords
@@ -146,14 +162,17 @@ def register(
     check_name("extent", extent, get_args(Extent))
     if isinstance(apply_to, str | bytes) or not isinstance(apply_to, Sequence):
         raise OptionError('`apply_to` must be a list of images, such as ["thermal.tif"]')
-    first, deep = load_image(image0, channels=channels), load_deep(image1, channels)
+    masks = ignore_masks(ignore, 2)
+    ((first, mask0), deep), values = read_in_one_range(
+        lambda: (load_visible(image0, channels, masks[0]), load_deep(image1, channels))
+    )
     second = to_8_bits(deep)
     matches = match_images(
         first,
         second,
         detector,
         selection=selection,
-        ignore=ignore,
+        ignore=(mask0, masks[1]),
         model="homography",
         mutual=mutual,
         seed=seed,
@@ -165,7 +184,7 @@ def register(
         raise RegistrationError(
             "no homography can be trusted: both images must show a plane or be taken from one place"
         )
-    grays = luma(first), luma(second)
+    grays = luma(first), luma(np.ascontiguousarray(second[:, :, :3]))
     if not agree(*grays, homography):
         raise RegistrationError(
             "the images contradict the homography of their matches: warped, they are no more alike "
@@ -178,7 +197,11 @@ def register(
         margins = (-top, bottom - first.shape[0], -left, right - first.shape[1])
         first = cv2.copyMakeBorder(first, *margins, cv2.BORDER_CONSTANT)
     moved, size = homography @ translation_matrix(left, top), (right - left, bottom - top)
-    warped, valid = warp_to_reference(deep, moved, size)
+    warped, valid = warp_visible(deep, moved, size)
+    if warped.dtype == np.uint16 and values is not None:
+        warped = from_16_bits(warped, values)
+        warped[~valid] = 0
+    shown = values if warped.dtype == np.uint16 and values is not None else (0, 65535)
     applied = []
     for each in apply_to:
         bands = load_deep(each, channels, raw=True)
@@ -188,7 +211,7 @@ def register(
             )
         no_data = read_metadata(each).no_data if is_file(each) else None
         applied.append(warp_bands(bands, moved, size, no_data))
-    numbers = len(matches), zncc, (left, top), tuple(applied)
+    numbers = len(matches), zncc, (left, top), tuple(applied), shown
     return Registration(homography, first, warped, valid, *numbers)
 
 

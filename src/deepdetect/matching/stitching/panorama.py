@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ..._shared.errors import OptionError, check_name
-from ..._shared.image_array import Channels, to_8_bits
+from ..._shared.alpha import continued
+from ..._shared.image_array import Channels, from_16_bits, to_8_bits
 from ..._shared.options import check_ranges, suggest_keywords, whole
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
-from ...io.image import load_deep
+from ...io.image import load_deep, read_in_one_range
+from ...io.image_file import read_with, reading_options
 from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .canvas import Canvas, least_distorted, plan_curved, plan_plane
@@ -58,7 +60,7 @@ class Panorama:
 
     Attributes:
         image: (H, W, 3) RGB, black outside of all images; uint16 if an image has more than 8 bits,
-            otherwise uint8.
+            otherwise uint8. If all images are uint16, its values are theirs.
         valid: (H, W) bool, true where an image is.
         homographies: (3, 3) homographies by image number, in the order in which images were
             connected. For a flat panorama they map to `image`, otherwise to the reference image.
@@ -174,11 +176,17 @@ def stitch(
     small: dict[int, tuple[np.ndarray, float]] = {}
     sizes: dict[int, tuple[int, int]] = {}
     with timer.stage("reading"):
-        for number, image in enumerate(images):
-            rgb = to_8_bits(load_deep(image, channels))
-            sizes[number] = (rgb.shape[1], rgb.shape[0])
-            small[number] = downscale(rgb, options.registration_side)
-        del rgb
+        kinds: set[np.dtype] = set()
+
+        def read() -> None:
+            for number, image in enumerate(images):
+                pixels = continued(load_deep(image, channels))
+                kinds.add(pixels.dtype)
+                pixels = to_8_bits(pixels)
+                sizes[number] = (pixels.shape[1], pixels.shape[0])
+                small[number] = downscale(pixels, options.registration_side)
+
+        _, values = read_in_one_range(read)
     with timer.stage("registration"):
         registration = register_images(
             [rgb for rgb, _ in small.values()],
@@ -194,9 +202,12 @@ def stitch(
     )
     canvas.check_size(options.max_canvas_megapixels)
     with timer.stage("compositing"):
-        panorama, valid, gains, parallax = composite(
-            lambda number: load_deep(images[number], channels), small, canvas
-        )
+        with read_with(replace(reading_options(), deep_range=values)):
+            panorama, valid, gains, parallax = composite(
+                lambda number: continued(load_deep(images[number], channels)), small, canvas
+            )
+        if values is not None and kinds == {panorama.dtype}:
+            panorama = np.where(valid[:, :, None], from_16_bits(panorama, values), 0)
         if crop:
             left, top, right, bottom = crop_box(valid, canvas.closed)
             part = (slice(top, bottom), slice(left, right))

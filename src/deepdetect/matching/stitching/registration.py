@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..._shared.alpha import hidden_pixels
 from ..._shared.errors import RegistrationError
 from ...detector.detector import AnyDetector, find_keypoints
 from ...detector.point_detector import PointDetector
@@ -92,6 +93,8 @@ def register_images(
 ) -> JointRegistration:
     """Find the homographies of overlapping images, (H, W, 3) uint8 RGB, to a common frame.
 
+    Images with transparent pixels are (H, W, 4), as in `alpha`.
+
     SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
     without heat map do both. The largest group of connected images is registered, or the group that
     contains image number `reference`. If `turning`, cameras that only rotate are estimated as well.
@@ -156,16 +159,18 @@ def _adjust(
     return homographies, cameras, residual_px
 
 
-def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
+def _prepare(pixels: np.ndarray, detector: AnyDetector) -> _Image:
+    image, hidden = np.ascontiguousarray(pixels[:, :, :3]), hidden_pixels(pixels)
     gray = luma(image)
     if not hasattr(detector, "heatmap"):
         if isinstance(detector, PointDetector):
-            points = detector.extract(image)
+            points = detector.extract(image, ignore=hidden)
         else:
-            points = describe_keypoints(gray, find_keypoints(detector, image))
+            points = describe_keypoints(gray, find_keypoints(detector, image, ignore=hidden))
         return _Image(gray, points, np.rint(points.xy))
     # The verification compares neighbouring pixels, so non-maximum suppression is off.
-    keypoints = find_keypoints(detector, image, SelectionOptions(max_keypoints=MAX_KEYPOINTS))
+    selection = SelectionOptions(max_keypoints=MAX_KEYPOINTS)
+    keypoints = find_keypoints(detector, image, selection, hidden)
     return _Image(gray, detect_sift(gray, SIFT_KEYPOINTS), keypoints.xy)
 
 
