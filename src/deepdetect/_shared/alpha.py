@@ -15,21 +15,18 @@ from .opencv import cv2
 GREY = 128
 """Transparent pixels get this 8-bit level, because it differs least from most images."""
 
-LITTLE_CONTRAST = 16
-"""If no opaque pixel differs by more 8-bit levels from `GREY`, transparent pixels become white,
-because a grey drawing would vanish on grey. Chosen by hand."""
+LITTLE_CONTRAST = 8
+"""If half of the opaque pixels differ by at most this many 8-bit levels from `GREY`, transparent
+pixels become white, because a grey drawing would vanish on grey. Chosen by hand."""
 
 
 def on_grey(
     rgb: np.ndarray, alpha: np.ndarray, opaque: float, name: str, *, associated: bool = False
 ) -> np.ndarray:
-    """Blend a (H, W, 3) uint8 or uint16 image with grey by its alpha, (H, W).
+    """Blend a (H, W, 3) uint8 or uint16 image with grey by its alpha, (H, W), white at `opaque`.
 
-    `opaque` is the value of alpha where the image hides the ground. If `associated`, the colours
-    are multiplied by alpha already. Pixels that are more ground than image count as transparent.
-
-    Returns:
-        The image itself if it is opaque, or else (H, W, 4), with the fourth channel as above.
+    If `associated`, the colours are multiplied by alpha already. Pixels that are more ground than
+    image count as transparent. If there are any, the result has the fourth channel.
     """
     if (alpha >= opaque).all():
         return rgb
@@ -40,39 +37,31 @@ def on_grey(
         return rgb
     top = int(np.iinfo(rgb.dtype).max)
     unit = top // 255
-    shown = rgb[alpha >= opaque] @ np.array([0.299, 0.587, 0.114]) - GREY * unit
-    faint = len(shown) and np.abs(shown).max() <= LITTLE_CONTRAST * unit
-    ground = top if faint else GREY * unit
+    contrast = np.abs(rgb[~hidden] @ np.array([0.299, 0.587, 0.114]) - GREY * unit)
+    ground = top if np.median(contrast) <= LITTLE_CONTRAST * unit else GREY * unit
     filled = np.full((*rgb.shape[:2], 4), top, rgb.dtype)
-    for row, (colours, part) in enumerate(zip(rgb, alpha, strict=True)):
-        share = (part / opaque).clip(0, 1)[:, None]
+    for row, colours in enumerate(rgb):
+        share = (alpha[row, :, None] / opaque).clip(0, 1)
         mixed = colours * (1.0 if associated else share) + ground * (1 - share)
         filled[row, :, :3] = np.rint(mixed.clip(0, top))
     filled[hidden] = (ground, ground, ground, 0)
     return filled
 
 
-def hidden_pixels(pixels: np.ndarray) -> np.ndarray | None:
-    """Return the (H, W) bool mask of the transparent pixels of an image, or None without any."""
-    return pixels[:, :, 3] == 0 if pixels.shape[2] == 4 else None
-
-
-def joined(*masks: np.ndarray | None) -> np.ndarray | None:
-    """Return where any of the masks is true, each (H, W) or None; None if all are None."""
-    given = [np.asarray(mask) != 0 for mask in masks if mask is not None]
-    return np.logical_or.reduce(given) if given else None
+def opaque_part(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the RGB of an image, and a (H, W) bool mask of its transparent pixels, or None."""
+    if pixels.shape[2] == 3:
+        return pixels, None
+    return np.ascontiguousarray(pixels[:, :, :3]), pixels[:, :, 3] == 0
 
 
 def continued(pixels: np.ndarray) -> np.ndarray:
-    """Give transparent pixels the colours of the nearest opaque ones; warped, these leave no rim."""
-    hidden = hidden_pixels(pixels)
+    """Give transparent pixels the colours of the nearest opaque ones, so that warps have no rim."""
+    rgb, hidden = opaque_part(pixels)
     if hidden is None:
         return pixels
-    _, labels = cv2.distanceTransformWithLabels(
-        hidden.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    places = np.zeros(labels.max() + 1, np.intp)
-    places[labels[~hidden]] = np.flatnonzero(~hidden)
-    found = pixels.copy()
-    found[hidden, :3] = pixels.reshape(-1, 4)[places[labels[hidden]], :3]
-    return found
+    kind = {"distanceType": cv2.DIST_L2, "maskSize": 5, "labelType": cv2.DIST_LABEL_PIXEL}
+    _, labels = cv2.distanceTransformWithLabels(hidden.astype(np.uint8), **kind)
+    colours = np.zeros((labels.max() + 1, 3), rgb.dtype)
+    colours[labels[~hidden]] = rgb[~hidden]
+    return np.dstack([colours[labels], pixels[:, :, 3]])

@@ -77,7 +77,7 @@ def array_to_pixels(
     if value_range is None:
         colours = array[:, :, :3] if array.ndim == 3 else array
         value_range = _range_of(colours, name, white)
-    values = in_range(array, value_range, name, deep)
+    values = _in_range(array, value_range, name, deep)
     if values.ndim == 2:
         return np.repeat(values[:, :, None], 3, axis=2)
     rgb = np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
@@ -96,9 +96,9 @@ def deep_values(image: Any) -> np.ndarray:
     return values.astype(np.uint16) if of_16_bits else values
 
 
-def to_8_bits(rgb: np.ndarray) -> np.ndarray:
-    """Convert a uint8 or uint16 image to uint8."""
-    return rgb if rgb.dtype == np.uint8 else in_range(rgb, (0, 65535))
+def to_8_bits(rgb: np.ndarray, value_range: Sequence[float] = (0, 65535)) -> np.ndarray:
+    """Convert a uint8 or uint16 image to uint8; the range is that of a uint16 image."""
+    return rgb if rgb.dtype == np.uint8 else _in_range(rgb, value_range, "", False)
 
 
 def from_16_bits(image: np.ndarray, value_range: Sequence[float]) -> np.ndarray:
@@ -183,9 +183,7 @@ def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, f
     )
 
 
-def in_range(
-    array: np.ndarray, value_range: Sequence[float], name: str = "the image", deep: bool = False
-) -> np.ndarray:
+def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
     """Scale to uint8 or uint16; `value_range` gives the values that become black and white."""
     (low, high), size = value_range, array.dtype.itemsize
     if array.dtype == np.uint8 and (low, high) == (0, 255):

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,30 +22,13 @@ to one in a thousand. Chosen by hand."""
 
 ValueRange = tuple[float, float]
 
-
-@dataclass
-class RangeOfCall:
-    """The range of the images of one call, `fixed`, or the counts of their values until then."""
-
-    fixed: ValueRange | None = None
-    counts: np.ndarray = field(default_factory=lambda: np.zeros(1 << 16, np.int64))
-    used: set[ValueRange] = field(default_factory=set)
-    name: str = ""
-
-    def settle(self) -> bool:
-        """Fix the range of all images counted; return whether any was read with another one."""
-        if self.used:
-            self.fixed = find_range(self.counts, f"{self.name} or an image beside it")
-        return bool(self.used) and self.used != {self.fixed}
-
-
-_call: ContextVar[RangeOfCall | None] = ContextVar("range of call", default=None)
+_call: ContextVar[ValueRange | np.ndarray | None] = ContextVar("range of call", default=None)
 
 
 @contextmanager
-def range_of_call(call: RangeOfCall | None) -> Iterator[None]:
-    """Read uint16 images in the block with the range of this call, or collect their values."""
-    token = _call.set(call)
+def range_of_call(values: ValueRange | np.ndarray | None) -> Iterator[None]:
+    """Read uint16 images in the block with one range, or add up the counts of their values."""
+    token = _call.set(values)
     try:
         yield
     finally:
@@ -59,19 +41,15 @@ def range_of_uint16(array: np.ndarray, name: str) -> ValueRange:
     call = _call.get()
     if call is None:
         return find_range(counts, name)
-    if call.fixed is not None:
-        low, high = call.fixed
-        outside = counts[1 : max(1, int(np.ceil(low)))].sum() + counts[int(high) + 1 : -1].sum()
-        if outside > MAX_OUTLIERS * counts.sum():
-            beyond = f"{outside / counts.sum():.1%} of {name} lies outside {low:g} to {high:g}, the"
-            what = f"{beyond} range of the images read before: give the range by `value_range`"
-            warnings.warn(what, UserWarning, stacklevel=2)
-        return call.fixed
-    call.counts += counts
-    call.name = call.name or name
-    found = find_range(counts)
-    call.used.add(found)
-    return found
+    if isinstance(call, np.ndarray):
+        call += counts
+        return find_range(counts)
+    low, high = map(round, call)
+    outside = (counts[1 : max(1, low)].sum() + counts[high + 1 : -1].sum()) / counts.sum()
+    if outside > MAX_OUTLIERS:
+        what = f"{outside:.1%} of {name} lies outside {low} to {high}, the range of other images"
+        warnings.warn(f"{what}: give the range by `value_range`", UserWarning, stacklevel=2)
+    return call
 
 
 def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
@@ -88,23 +66,21 @@ def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
     if not len(inner):
         return 0, full
     total = np.cumsum(counts[inner])
-    least, most = MAX_OUTLIERS * total[-1], (1 - MAX_OUTLIERS) * total[-1]
-    low, high = (int(inner[np.searchsorted(total, share)]) for share in (least, most))
+    shares = (MAX_OUTLIERS * total[-1], (1 - MAX_OUTLIERS) * total[-1])
+    low, high = inner[np.searchsorted(total, shares)].tolist()
     white = _white_above(high)
-    gap = not counts[white + 1 : 2 * white + 2].any()
-    padded = counts[65535] > MAX_OUTLIERS * total[-1]
-    if not gap or (padded and white < 256):
+    padded = counts[65535] > shares[0]
+    if counts[white + 1 : 2 * white + 2].any() or (padded and white < 256):
         white, high = full, 65535 if padded else high
     width = high - low
     narrow = 0 < width < min(low, LITTLE_RANGE * white)
-    if name is not None and (narrow or 0 < high < LITTLE_RANGE * white):
-        tell_if_little(width / white, f"{name}, with values from {low} to {high},")
+    if name is not None and (narrow or high < LITTLE_RANGE * white):
+        tell_if_little((width if narrow else high) / white, name)
     if not narrow:
         return 0, white
-    least, most = int(inner[0]), int(inner[inner <= white][-1])
-    low, high = max(least, low - width), min(most, high + width)
+    low, high = max(inner[0], low - width), min(inner[inner <= white][-1], high + width)
     margin = max(0, 255 - (high - low))
-    return low - margin // 2, high + margin - margin // 2
+    return float(low - margin // 2), float(high + margin - margin // 2)
 
 
 def tell_if_little(used: float, name: str) -> None:

@@ -25,7 +25,7 @@ from ..features.selection import SelectionOptions
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
-from ..io.image import load_image, load_visible, one_range
+from ..io.image import load_image, load_pixels, one_range
 from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_picture
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
@@ -119,7 +119,7 @@ def match(
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
     stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
-    load = lru_cache(2)(load_visible)  # successive pairs share an image
+    load = lru_cache(2)(load_pixels)  # successive pairs share an image
     found: list[dict[str, Any]] = []
     failures: list[str] = []
     seen = [*dict.fromkeys(inputs)]
@@ -128,10 +128,9 @@ def match(
             name = " ".join(map(str, pair)) if many else ""
             with noted_failures(name, failures):
                 with cli.writing(files, pair, overwrite) as made:
-                    (rgb0, mask0), (rgb1, mask1) = map(load, pair)
+                    rgb0, rgb1 = map(load, pair)
                     with stage_progress("matching", stages, quiet=many) as done:
                         settings = values | {"options": geometry, "progress": done}
-                        settings["ignore"] = (mask0, mask1)
                         matches = match_pair(rgb0, rgb1, chosen, selection=selection, **settings)
                     save_matches(matches, made["file"])
                     if pictures:
@@ -160,7 +159,6 @@ def _match_unguided(
     detector: DeepDetect | PointDetector,
     *,
     selection: SelectionOptions | None,
-    ignore: tuple[np.ndarray | None, np.ndarray | None],
     options: GeometryOptions,
     progress: Callable[[str], object],
     model: str = "auto",
@@ -170,8 +168,7 @@ def _match_unguided(
     timer = StageTimer(progress)
     with timer.stage("keypoints"):
         chosen = {} if selection is None else vars(selection)
-        images = zip((image0, image1), ignore, strict=True)
-        features = [detector.extract(image, ignore=mask, **chosen) for image, mask in images]
+        features = [detector.extract(image, **chosen) for image in (image0, image1)]
     with timer.stage("matching"):
         matches = match_features(*features, seed=seed, **values)
     with timer.stage("geometry"):
@@ -311,7 +308,8 @@ def register(
                 kept.write_tiff(bands, made[path])
             else:
                 every = (0, 65535) if bands.dtype == np.uint16 else None  # keeps their numbers
-                rgb = array_to_rgb(bands, value_range=every, deep=True)
+                rgb = array_to_rgb(bands[:, :, :3], value_range=every, deep=True)
+                rgb[(bands[:, :, 3:] == 0).any(axis=2)] = 0  # transparent
                 rgb = found.warped if path == image1 else rgb
                 save_picture(rgb, made[path], kept)
             kept.write_beside(files[path])
@@ -395,8 +393,12 @@ def stitch(
                 text = text.replace(f"images[{number}]", str(path))
             raise type(error)(text) from error
         moved = panorama.homographies[panorama.reference] if flat else None
-        kept = replace(carried[panorama.reference], no_data=None).moved(moved)
-        save_picture(panorama.image, made["file"], kept)
+        kept, image = carried[panorama.reference].moved(moved), panorama.image
+        if kept.no_data is not None and kept.no_data in range(np.iinfo(image.dtype).max + 1):
+            image = np.where(panorama.valid[..., None], image, image.dtype.type(kept.no_data))
+        else:
+            kept = replace(kept, no_data=None)
+        save_picture(image, made["file"], kept)
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
         cli.say(f"{images[number]} is not in the panorama: {reason}")

@@ -351,12 +351,13 @@ def find_keypoints(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | None = None,
 ) -> Keypoints:
-    """Find the keypoints of a (H, W, 3) uint8 image with any detector.
+    """Find the keypoints of a (H, W, 3) or (H, W, 4) uint8 image with any detector.
 
     A detector is any object with a method `detect` or `heatmap` like those of this package. If
     the detector has heat maps, `selection` chooses their pixels; None: pixels above 0.5.
     """
     check_selection(detector, selection)
+    rgb, ignore = load_visible(rgb, ignore=ignore)
     if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):
         raise OptionError(f"the detector {detector!r} has no method detect: use a DeepDetect")
     if hasattr(detector, "detect") and not hasattr(detector, "heatmap"):

@@ -10,19 +10,18 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError, ImageError, MissingImageError, OptionError
-from .._shared.alpha import hidden_pixels, joined, on_grey
+from .._shared.alpha import on_grey, opaque_part
+from .._shared.errors import ImageError, MissingImageError, OptionError
 from .._shared.image_array import Channels, array_to_pixels, check_channels, deep_values
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import was_made
-from .._shared.value_range import RangeOfCall, ValueRange, range_of_call
+from .._shared.value_range import find_range, range_of_call
 from ..features.selection import check_ignore
 from .image_file import (
     IMAGE_SUFFIXES,
@@ -31,6 +30,7 @@ from .image_file import (
     damaged_image,
     file_name,
     is_file,
+    is_path,
     open_file,
     open_image,
     read_with,
@@ -40,8 +40,6 @@ from .tiff import TIFF_STARTS, read_tiff
 
 Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
-
-T = TypeVar("T")
 
 MINIMUM_SIDE = 16
 """Images must be at least this many pixels wide and high. Chosen by hand."""
@@ -135,80 +133,60 @@ def load_image(
         page=page,
         allow_truncated=allow_truncated,
     )
-    pixels = _load(image, channels, options, value_range=value_range, bands=bands)
-    return np.ascontiguousarray(pixels[:, :, :3])
+    return opaque_part(_load(image, channels, options, value_range=value_range, bands=bands))[0]
+
+
+def load_pixels(
+    image: Any, channels: Channels = "rgb", *, deep: bool = False, raw: bool = False
+) -> np.ndarray:
+    """Read an image like `load_image`, with a fourth channel, as in `alpha`, if it is transparent.
+
+    If `deep`, images with more than 8 bits per channel become uint16. If `raw`, arrays and files
+    keep their numbers, and arrays and TIFF files all their bands, (H, W, C).
+    """
+    return _load(image, channels, reading_options(), deep=deep, raw=raw)
 
 
 def load_visible(
     image: Any, channels: Channels = "rgb", ignore: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read an image like `load_image`; also return where it shows nothing that may be matched.
-
-    That is (H, W) bool, true where pixels are transparent or the mask `ignore` is true, or None.
-    """
-    pixels = _load(image, channels, reading_options())
-    hidden = hidden_pixels(pixels)
-    if hidden is not None:
-        if ignore is not None:
-            hidden = joined(hidden, check_ignore(ignore, hidden.shape))
-        return np.ascontiguousarray(pixels[:, :, :3]), hidden
-    return pixels, ignore
-
-
-def load_deep(image: Any, channels: Channels, *, raw: bool = False) -> np.ndarray:
-    """Read an image like `load_image`, but as uint16 if it has more than 8 bits per channel.
-
-    The result has a fourth channel if pixels are transparent, as `alpha` defines it. If `raw`,
-    arrays and files keep all their bands, (H, W, C), and numbers, in their own data type.
-    """
-    return _load(image, channels, reading_options(), deep=True, raw=raw)
-
-
-def read_in_one_range(read: Callable[[], T]) -> tuple[T, ValueRange | None]:
-    """Return what `read` returns, which loads all images of a call, and their common range.
-
-    The range is None if no image is deep, or all state their ranges. If the images alone would
-    have other ranges, `read` is called twice.
-    """
-    call = RangeOfCall(reading_options().deep_range)
-    with range_of_call(call):
-        found = read()
-        if call.settle():
-            found = read()
-    return found, call.fixed
+    """Read an image like `load_image`; return it, and the mask `ignore` with transparent pixels."""
+    rgb, hidden = opaque_part(load_pixels(image, channels))
+    if hidden is None or ignore is None:
+        return rgb, ignore if hidden is None else hidden
+    return rgb, hidden | check_ignore(ignore, hidden.shape)
 
 
 def load_pair(
-    images: tuple[Any, Any], channels: Channels = "rgb", ignore: Any = None
+    images: tuple[Any, Any], channels: Channels, ignore: Any = None
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray | None, np.ndarray | None]]:
     """Load two images with one range; return both images, and both masks of `load_visible`."""
     masks = ignore_masks(ignore, 2)
-    read = partial(load_visible, channels=channels)
-    (first, second), _ = read_in_one_range(
-        lambda: [read(image, ignore=mask) for image, mask in zip(images, masks, strict=True)]
-    )
-    return (first[0], second[0]), (first[1], second[1])
+    with one_range(images, channels):
+        first, mask0 = load_visible(images[0], channels, masks[0])
+        second, mask1 = load_visible(images[1], channels, masks[1])
+    return (first, second), (mask0, mask1)
 
 
 @contextmanager
-def one_range(images: Sequence[Any], channels: Channels = "rgb") -> Iterator[ReadingOptions]:
-    """Read the deep images of a call with one range in the block, that of all that are seen first.
+def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOptions]:
+    """Read the uint16 images of a call with one range in the block; yield the options of reading.
 
-    These are all images, or `SEEN_IMAGES` of a longer list, at equal steps, if the first is deep.
-    Yields the options, which hold the range, for other processes.
+    The range is that of all images together, or of `SEEN_IMAGES` of a longer list at equal steps,
+    if the first is of this kind. Pipes and open files are left out, as they may be readable once.
     """
-    options = reading_options()
-    if options.deep_range is None and options.value_range is None and len(images) > 1:
-        call = RangeOfCall()
-        step = -(-len(images) // SEEN_IMAGES)
-        for image in images[::step]:
-            with suppress(DeepDetectError), range_of_call(call), warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                _load(image, channels, options)
-            if not call.used:
-                break
-        call.settle()
-        options = replace(options, deep_range=call.fixed)
+    options, counts = reading_options(), np.zeros(1 << 16, np.int64)
+    seen = images[:: -(-len(images) // SEEN_IMAGES) or 1] if options.deep_range is None else ()
+    for image in seen:
+        if (is_path(image) and not Path(image).is_file()) or hasattr(image, "read"):
+            break
+        with suppress(Exception), range_of_call(counts), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            _load(image, channels, options)
+        if not counts.any():
+            break
+    if counts.any():
+        options = replace(options, deep_range=find_range(counts, file_name(images[0])))
     with read_with(options):
         yield options
 
@@ -222,10 +200,6 @@ def _load(
     raw: bool = False,
     **for_arrays: Any,  # options of this call; those of a command do not apply to arrays
 ) -> np.ndarray:
-    if options.deep_range is not None:
-        with range_of_call(RangeOfCall(options.deep_range)):
-            options = replace(options, deep_range=None)
-            return _load(image, channels, options, deep=deep, raw=raw, **for_arrays)
     if is_file(image):
         rgb = _read_file(image, options, deep, raw)
     elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
@@ -278,6 +252,14 @@ def image_named(number: int) -> Iterator[None]:
         yield
     except (ImageError, OptionError) as error:
         raise type(error)(f"images[{number}]: {error}") from None
+
+
+def at_pixels(mask: np.ndarray | None, xy: np.ndarray) -> np.ndarray:
+    """Return, (N,) bool, at which of (N, 2) positions a mask of `load_visible` is true."""
+    if mask is None:
+        return np.zeros(len(xy), bool)
+    columns, rows = np.rint(xy).clip(0, np.subtract(np.shape(mask)[::-1], 1)).astype(np.intp).T
+    return np.asarray(mask)[rows, columns] != 0
 
 
 def ignore_masks(ignore: Any, images: int) -> list[Any]:
@@ -376,7 +358,20 @@ def _read_file(
                     rgb = _from_pil(image, name, options.value_range, deep, raw)
                 orientation = orientation_of(image)
             del image  # frees its pixels before `UPRIGHT` makes another copy
+    if is_path(source) and rgb.shape[2] == 3 and not raw and Path(f"{name}.msk").is_file():
+        with open_image(f"{name}.msk", what="mask") as mask:  # that of GDAL
+            rgb = on_grey(rgb, np.asarray(mask.resize(rgb.shape[1::-1])) != 0, 1, name)
+    if is_path(source) and not raw and rgb.shape[2] == 3 and Path(f"{name}.msk").is_file():
+        rgb = _behind_mask(rgb, name)
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
+
+
+def _behind_mask(rgb: np.ndarray, name: str) -> np.ndarray:
+    """Make the pixels transparent that are 0 in NAME.msk, GDAL's mask beside an image file."""
+    with open_image(f"{name}.msk", what="mask") as mask:
+        shown = np.asarray(mask) != 0
+    shown = shown.reshape(*shown.shape[:2], -1).any(axis=2)
+    return on_grey(rgb, shown, 1, name) if shown.shape == rgb.shape[:2] else rgb
 
 
 def _deep_png(

@@ -29,6 +29,7 @@ from .._shared.errors import (
     first_line,
 )
 from .._shared.options import shown, suggest_keywords, whole
+from .._shared.value_range import range_of_call
 
 FORMATS = {
     "JPEG": ".jpg .jpeg .jpe .jfif",
@@ -146,7 +147,8 @@ def read_with(options: ReadingOptions) -> Iterator[None]:
     """
     token = _reading.set(options)
     try:
-        yield
+        with range_of_call(options.deep_range):
+            yield
     finally:
         _reading.reset(token)
 

@@ -12,8 +12,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from .._shared.errors import ImageError, MissingExtraError
 from .._shared.alpha import on_grey
+from .._shared.errors import ImageError, MissingExtraError
 from .._shared.image_array import array_to_pixels
 from .image_file import ReadingOptions, damaged_image, develop, identify
 
@@ -29,11 +29,7 @@ JPEG = (6, 7)
 """Codes of JPEG compression, the only compression with which YCbCr is read."""
 
 ALPHA = (1, 2)
-"""Types of extra samples that are alpha and not a band."""
-
-ASSOCIATED = 1
-"""The type of alpha by which the colours are multiplied already."""
-
+"""Types of extra samples that are alpha and not a band; the first has multiplied the colours."""
 ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
@@ -134,9 +130,7 @@ def _to_pixels(
     photometric = int(page.photometric)
     chosen = _chosen_bands(bands, page, name, options)
     value = no_data_of(page)
-    absent = np.isnan(chosen) if chosen.dtype.kind == "f" else np.zeros(chosen.shape, bool)
-    if value is not None:
-        absent |= chosen == value
+    absent = np.isnan(chosen) | (chosen == (np.nan if value is None else value))
     if absent.any():
         chosen = np.where(absent, chosen.dtype.type(0), chosen)
     if photometric == PALETTE:
@@ -152,14 +146,12 @@ def _to_pixels(
         )
     if photometric == MIN_IS_WHITE:
         rgb = ~rgb
-    known = ~absent.any(axis=2)
+    alpha, opaque = ~absent.any(axis=2), 1
     extra = [each in ALPHA for each in page.extrasamples]
     if any(extra):  # the extra samples are the last ones
-        alpha = bands[:, :, extra.index(True) - len(extra)]
-        opaque = 255 if alpha.dtype == np.uint8 else max(alpha.max(), 1)
-        associated = ASSOCIATED in page.extrasamples
-        return on_grey(rgb, np.where(known, alpha, 0), opaque, name, associated=associated)
-    return on_grey(rgb, known, 1, name)
+        alpha = np.where(alpha, bands[:, :, extra.index(True) - len(extra)], 0)
+        opaque = 255 if bands.dtype == np.uint8 else max(alpha.max(), 1)
+    return on_grey(rgb, alpha, opaque, name, associated=ALPHA[0] in page.extrasamples)
 
 
 def _chosen_bands(bands: np.ndarray, page: Any, name: str, options: ReadingOptions) -> np.ndarray:

@@ -29,7 +29,7 @@ from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import Images, load_pair, luma
+from ..io.image import Images, at_pixels, load_pair, luma
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 
@@ -279,13 +279,8 @@ def _match_guided(
 
 def _unmasked(matches: Matches, masks: Sequence[np.ndarray | None]) -> Matches:
     """Drop matches that end in a mask: the second image may show them where it has no keypoint."""
-    kept = np.ones(len(matches), bool)
-    for points, mask in zip((matches.points0, matches.points1), masks, strict=True):
-        if mask is not None:
-            limits = np.subtract(np.shape(mask)[::-1], 1)
-            columns, rows = np.rint(points).clip(0, limits).astype(np.intp).T
-            kept &= np.asarray(mask)[rows, columns] == 0
-    return matches if kept.all() else matches[kept]
+    dropped = at_pixels(masks[0], matches.points0) | at_pixels(masks[1], matches.points1)
+    return matches[~dropped] if dropped.any() else matches
 
 
 def _found_both_ways(matches: Matches, back: Matches) -> Matches:

@@ -8,8 +8,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from .._shared.alpha import opaque_part
 from .._shared.errors import OptionError, RegistrationError, check_name
-from .._shared.image_array import Channels, from_16_bits, in_range, to_8_bits
+from .._shared.image_array import Channels, from_16_bits, to_8_bits
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.value_range import ValueRange
@@ -22,14 +23,7 @@ from ..geometry.transforms import (
     transform_points,
     translation_matrix,
 )
-from ..io.image import (
-    Images,
-    ignore_masks,
-    load_deep,
-    load_visible,
-    luma,
-    read_in_one_range,
-)
+from ..io.image import Images, load_pixels, luma, one_range
 from ..io.image_file import file_name, is_file
 from ..io.picture_file import read_metadata
 from .pipeline import match_images
@@ -64,8 +58,8 @@ class Registration:
         first: (H, W, 3) uint8 RGB, the first image in the frame. With the extent "union" it is
             black outside its own area.
         warped: (H, W, 3) RGB, the second image warped into the frame, black where it has no
-            content. It is uint16 if the second image has more than 8 bits, otherwise uint8. Values
-            of uint16 images are those of the second image.
+            content. It is uint16 if the second image has more than 8 bits, otherwise uint8. A
+            uint16 image keeps its numbers.
         valid: (H, W) bool, where the warped image has content.
         matches: number of dense matches that were kept.
         zncc: median local ZNCC of both images over their overlap, in [-1, 1].
@@ -102,16 +96,12 @@ class Registration:
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
         second = self.valid & ((row + column) % 2 == 1)
-        return np.where(second[..., None], self._second, self.first)
+        return np.where(second[..., None], to_8_bits(self.warped, self.value_range), self.first)
 
     def difference(self) -> np.ndarray:
         """Return the absolute difference of both images, (H, W, 3) uint8; 0 outside the overlap."""
-        return np.where(self.valid[..., None], cv2.absdiff(self.first, self._second), 0)
-
-    @property
-    def _second(self) -> np.ndarray:
-        deep = self.warped.dtype == np.uint16
-        return in_range(self.warped, self.value_range) if deep else self.warped
+        second = to_8_bits(self.warped, self.value_range)
+        return np.where(self.valid[..., None], cv2.absdiff(self.first, second), 0)
 
 
 @suggest_keywords
@@ -162,17 +152,15 @@ def register(
     check_name("extent", extent, get_args(Extent))
     if isinstance(apply_to, str | bytes) or not isinstance(apply_to, Sequence):
         raise OptionError('`apply_to` must be a list of images, such as ["thermal.tif"]')
-    masks = ignore_masks(ignore, 2)
-    ((first, mask0), deep), values = read_in_one_range(
-        lambda: (load_visible(image0, channels, masks[0]), load_deep(image1, channels))
-    )
+    with one_range((image1, image0), channels) as reading:
+        first, deep = load_pixels(image0, channels), load_pixels(image1, channels, deep=True)
     second = to_8_bits(deep)
     matches = match_images(
         first,
         second,
         detector,
         selection=selection,
-        ignore=(mask0, masks[1]),
+        ignore=ignore,
         model="homography",
         mutual=mutual,
         seed=seed,
@@ -184,7 +172,7 @@ def register(
         raise RegistrationError(
             "no homography can be trusted: both images must show a plane or be taken from one place"
         )
-    grays = luma(first), luma(np.ascontiguousarray(second[:, :, :3]))
+    grays = luma(opaque_part(first)[0]), luma(opaque_part(second)[0])
     if not agree(*grays, homography):
         raise RegistrationError(
             "the images contradict the homography of their matches: warped, they are no more alike "
@@ -198,20 +186,23 @@ def register(
         first = cv2.copyMakeBorder(first, *margins, cv2.BORDER_CONSTANT)
     moved, size = homography @ translation_matrix(left, top), (right - left, bottom - top)
     warped, valid = warp_visible(deep, moved, size)
-    if warped.dtype == np.uint16 and values is not None:
-        warped = from_16_bits(warped, values)
-        warped[~valid] = 0
-    shown = values if warped.dtype == np.uint16 and values is not None else (0, 65535)
+    (first, empty), hidden = opaque_part(first), opaque_part(deep)[1]
+    if empty is not None:  # there the first image shows what is behind it
+        first = np.where((empty & valid)[..., None], to_8_bits(warped), first)
+    values = reading.deep_range or (0, 65535)
+    warped = from_16_bits(warped, values) if warped.dtype == np.uint16 else warped
+    warped = np.where(valid[..., None], warped, 0)
     applied = []
     for each in apply_to:
-        bands = load_deep(each, channels, raw=True)
+        bands = load_pixels(each, channels, deep=True, raw=True)
         if bands.shape[:2] != deep.shape[:2]:
             raise OptionError(
                 f"{file_name(each)} must have the size of the second image: leave it out"
             )
         no_data = read_metadata(each).no_data if is_file(each) else None
-        applied.append(warp_bands(bands, moved, size, no_data))
-    numbers = len(matches), zncc, (left, top), tuple(applied), shown
+        seen = hidden if each is image1 else None
+        applied.append(warp_bands(bands, moved, size, no_data, seen))
+    numbers = len(matches), zncc, (left, top), tuple(applied), values
     return Registration(homography, first, warped, valid, *numbers)
 
 

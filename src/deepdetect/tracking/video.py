@@ -22,8 +22,8 @@ from .._shared.errors import (
 )
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from ..io.image import find_images, load_image
-from ..io.image_file import IMAGE_SUFFIXES
+from ..io.image import find_images, load_image, load_pixels, one_range
+from ..io.image_file import IMAGE_SUFFIXES, read_with
 
 FOLDER_FPS = 10.0
 """This rate, in frames per second, is assumed for folders and for videos that state no rate."""
@@ -41,7 +41,7 @@ class Frame:
 
     Attributes:
         number: number in the source, from 0 on.
-        rgb: (H, W, 3) uint8 pixels.
+        rgb: (H, W, 3) uint8 pixels, or (H, W, 4) if some are transparent.
     """
 
     number: int
@@ -118,9 +118,12 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
     def _from_images(self) -> Iterator[Frame]:
         first: tuple[int, ...] = ()
+        with one_range(self._images[:: self.every]) as reading:
+            pass
         for number, path in list(enumerate(self._images))[:: self.every]:
             try:
-                rgb = load_image(path)
+                with read_with(reading):
+                    rgb = load_pixels(path)
             except ImageError as error:
                 self.failures.append(str(error))
                 continue

@@ -15,7 +15,7 @@ from ..._shared.errors import OptionError, RegistrationError
 from ..._shared.machine import require_memory
 from ..._shared.opencv import cv2
 from ...geometry.camera import Camera
-from ...geometry.images import MAX_UNKNOWN_WEIGHT, antialiased
+from ...geometry.images import antialiased, without_touched
 from ...geometry.transforms import (
     outer_corners,
     scaled_homography,
@@ -151,7 +151,7 @@ def plan_plane(
         )
         whole = np.full(rgb.shape[:2], 255, np.uint8)
         mask = cv2.warpPerspective(whole, homography, size, flags=cv2.INTER_NEAREST)
-        return WarpedImage(*_visible(drawn, mask), (left, top))
+        return WarpedImage(*without_touched(drawn, mask), (left, top))
 
     return Canvas(boxes, draw), placed
 
@@ -225,7 +225,7 @@ def plan_curved(
             part = slice(max(-left, 0), min(around - left, mask.shape[1]))
             drawn, mask, left = drawn[:, part], mask[:, part], left + part.start
         corner = left - round(origin * canvas_scale), up - round(top * canvas_scale)
-        return WarpedImage(*_visible(drawn, mask), corner)
+        return WarpedImage(*without_touched(drawn, mask), corner)
 
     return Canvas(boxes, draw, closed)
 
@@ -233,14 +233,6 @@ def plan_curved(
 def image_of(place: int) -> int:
     """Return the image number of a key of `Canvas.boxes`, which is the number or ~number."""
     return max(place, ~place)
-
-
-def _visible(drawn: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return RGB of a warped image, and its mask without the pixels that transparent ones touch."""
-    if drawn.shape[2] == 3:
-        return drawn, mask
-    touched = drawn[:, :, 3] < np.iinfo(drawn.dtype).max * (1 - MAX_UNKNOWN_WEIGHT)
-    return np.ascontiguousarray(drawn[:, :, :3]), np.where(touched, np.uint8(0), mask)
 
 
 def _smooth(rgb: np.ndarray, shown: float) -> np.ndarray:

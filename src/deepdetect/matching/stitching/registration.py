@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..._shared.alpha import hidden_pixels
 from ..._shared.errors import RegistrationError
 from ...detector.detector import AnyDetector, find_keypoints
 from ...detector.point_detector import PointDetector
@@ -91,9 +90,7 @@ def register_images(
     seed: int = 0,
     progress: Callable[[str], object] | None = None,
 ) -> JointRegistration:
-    """Find the homographies of overlapping images, (H, W, 3) uint8 RGB, to a common frame.
-
-    Images with transparent pixels are (H, W, 4), as in `alpha`.
+    """Find the homographies of overlapping uint8 images of 3 or 4 channels to a common frame.
 
     SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
     without heat map do both. The largest group of connected images is registered, or the group that
@@ -159,18 +156,16 @@ def _adjust(
     return homographies, cameras, residual_px
 
 
-def _prepare(pixels: np.ndarray, detector: AnyDetector) -> _Image:
-    image, hidden = np.ascontiguousarray(pixels[:, :, :3]), hidden_pixels(pixels)
-    gray = luma(image)
+def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
+    gray = luma(np.ascontiguousarray(image[:, :, :3]))
     if not hasattr(detector, "heatmap"):
         if isinstance(detector, PointDetector):
-            points = detector.extract(image, ignore=hidden)
+            points = detector.extract(image)
         else:
-            points = describe_keypoints(gray, find_keypoints(detector, image, ignore=hidden))
+            points = describe_keypoints(gray, find_keypoints(detector, image))
         return _Image(gray, points, np.rint(points.xy))
     # The verification compares neighbouring pixels, so non-maximum suppression is off.
-    selection = SelectionOptions(max_keypoints=MAX_KEYPOINTS)
-    keypoints = find_keypoints(detector, image, selection, hidden)
+    keypoints = find_keypoints(detector, image, SelectionOptions(max_keypoints=MAX_KEYPOINTS))
     return _Image(gray, detect_sift(gray, SIFT_KEYPOINTS), keypoints.xy)
 
 
