@@ -12,13 +12,6 @@ import numpy as np
 
 from .opencv import cv2
 
-GREY = 128
-"""Transparent pixels get this 8-bit level, because it differs least from most images."""
-
-LITTLE_CONTRAST = 8
-"""If half of the opaque pixels differ by at most this many 8-bit levels from `GREY`, transparent
-pixels become white, because a grey drawing would vanish on grey. Chosen by hand."""
-
 
 def on_grey(
     rgb: np.ndarray, alpha: np.ndarray, opaque: float, name: str, *, associated: bool = False
@@ -36,12 +29,10 @@ def on_grey(
         warnings.warn(left_out, UserWarning, stacklevel=2)
         return rgb
     top = int(np.iinfo(rgb.dtype).max)
-    unit = top // 255
-    contrast = np.abs(rgb[~hidden] @ np.array([0.299, 0.587, 0.114]) - GREY * unit)
-    ground = top if np.median(contrast) <= LITTLE_CONTRAST * unit else GREY * unit
+    ground = top // 2 + 1  # mid-grey differs least from most images
     filled = np.full((*rgb.shape[:2], 4), top, rgb.dtype)
     for row, colours in enumerate(rgb):
-        share = (alpha[row, :, None] / opaque).clip(0, 1)
+        share = np.divide(alpha[row, :, None], opaque, dtype=np.float64).clip(0, 1)
         mixed = colours * (1.0 if associated else share) + ground * (1 - share)
         filled[row, :, :3] = np.rint(mixed.clip(0, top))
     filled[hidden] = (ground, ground, ground, 0)

@@ -21,7 +21,17 @@ from ..features.selection import (
     select_keypoints,
 )
 from ..features.sift import describe_keypoints
-from ..io.image import Images, image_named, load_each, load_image, load_visible, luma
+from ..io.image import (
+    Images,
+    batch_length,
+    ignore_masks,
+    image_named,
+    load_each,
+    load_image,
+    load_pixels,
+    load_visible,
+    luma,
+)
 from .backends import RuntimeOptions, open_network
 from .heatmap import HeatmapOptions, compute_maps, memory_named
 from .pretrained import PRETRAINED, resolve_weights
@@ -251,8 +261,7 @@ class DeepDetect:
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        rgb, ignore = load_visible(image, channels, ignore)
-        return self._select(rgb, options, ignore)
+        return self._select(load_pixels(image, channels), options, ignore)
 
     @suggest_keywords
     def detect_batch(
@@ -282,10 +291,10 @@ class DeepDetect:
             OptionError: an option is out of its range, or a mask has another size than its image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        found = []
-        for number, rgb, mask in load_each(images, channels, ignore):
+        masks, found = ignore_masks(ignore, batch_length(images)), []
+        for number, rgb in load_each(images, channels):
             with image_named(number):
-                found.append(self._select(rgb, options, mask))
+                found.append(self._select(rgb, options, masks[number]))
         return found
 
     @suggest_keywords
@@ -315,7 +324,7 @@ class DeepDetect:
             ImageError: the image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
-        rgb, ignore = load_visible(image, channels, ignore)
+        rgb = load_pixels(image, channels)
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
         return describe_keypoints(luma(rgb), self._select(rgb, options, ignore))
 
@@ -324,6 +333,7 @@ class DeepDetect:
     ) -> Keypoints:
         if options.max_keypoints is None:
             options = replace(options, max_keypoints=self.max_keypoints)
+        rgb, ignore = load_visible(rgb, ignore=ignore)
         with memory_named(rgb.shape):
             maps = compute_maps(rgb, self._network, self.heatmap_options)
             del rgb  # frees memory for the keypoints

@@ -25,6 +25,7 @@ from .._shared.value_range import find_range, range_of_call
 from ..features.selection import check_ignore
 from .image_file import (
     IMAGE_SUFFIXES,
+    PNG_SIGNATURE,
     RAW_SUFFIXES,
     ReadingOptions,
     damaged_image,
@@ -173,22 +174,32 @@ def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOption
     """Read the uint16 images of a call with one range in the block; yield the options of reading.
 
     The range is that of all images together, or of `SEEN_IMAGES` of a longer list at equal steps,
-    if the first is of this kind. Pipes and open files are left out, as they may be readable once.
+    if the first may be of this kind. Open files and pipes, which may be readable once, are not.
     """
     options, counts = reading_options(), np.zeros(1 << 16, np.int64)
     seen = images[:: -(-len(images) // SEEN_IMAGES) or 1] if options.deep_range is None else ()
     for image in seen:
-        if (is_path(image) and not Path(image).is_file()) or hasattr(image, "read"):
-            break
         with suppress(Exception), range_of_call(counts), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            _load(image, channels, options)
+            if _may_be_deep(image):
+                _load(image, channels, options)
         if not counts.any():
             break
     if counts.any():
         options = replace(options, deep_range=find_range(counts, file_name(images[0])))
     with read_with(options):
         yield options
+
+
+def _may_be_deep(image: Any) -> bool:
+    """Return whether an image may have 16 bits per channel, by the first bytes of a file."""
+    if is_path(image) and Path(image).is_file():
+        with open(image, "rb") as file:
+            image = file.read(HEADER_BYTES)
+    if isinstance(image, (bytes, bytearray)):
+        png = image[:4] == PNG_SIGNATURE[:4] and image[24] == 16
+        return png or image[:4] in TIFF_STARTS or image[4:6] == b"jP"  # JPEG 2000
+    return not is_file(image) and getattr(image, "dtype", None) != np.uint8
 
 
 def _load(
@@ -219,21 +230,16 @@ def _load(
     return rgb
 
 
-def load_each(
-    images: Images, channels: Channels, ignore: Any = None
-) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
-    """Load the images of a list, tuple or batch one by one, with one range.
-
-    Yields the index and the results of `load_visible` of each. `ignore` is one mask or a list.
-    """
-    masks = ignore_masks(ignore, batch_length(images))
+def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
+    """Load the images of a list, tuple or batch one by one; yield the index and pixels of each."""
+    batch_length(images)
     with one_range(images, channels) as reading:
         pass
     for number, image in enumerate(images):
         with image_named(number), read_with(reading):
-            loaded = load_visible(image, channels, masks[number])
-        yield number, *loaded
-        del loaded
+            pixels = load_pixels(image, channels)
+        yield number, pixels
+        del pixels
 
 
 def batch_length(images: Images) -> int:
@@ -272,8 +278,8 @@ def ignore_masks(ignore: Any, images: int) -> list[Any]:
 
 
 def luma(rgb: np.ndarray) -> np.ndarray:
-    """Return the 8-bit luma (ITU-R BT.601) of a (H, W, 3) uint8 RGB image as (H, W) uint8."""
-    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    """Return the 8-bit luma (ITU-R BT.601) of a uint8 image of 3 or 4 channels, (H, W) uint8."""
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY if rgb.shape[2] == 3 else cv2.COLOR_RGBA2GRAY)
 
 
 def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:

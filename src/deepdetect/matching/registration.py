@@ -172,7 +172,7 @@ def register(
         raise RegistrationError(
             "no homography can be trusted: both images must show a plane or be taken from one place"
         )
-    grays = luma(opaque_part(first)[0]), luma(opaque_part(second)[0])
+    grays = luma(first), luma(second)
     if not agree(*grays, homography):
         raise RegistrationError(
             "the images contradict the homography of their matches: warped, they are no more alike "

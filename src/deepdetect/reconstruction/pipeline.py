@@ -137,7 +137,8 @@ def reconstruct(
     else:
         with timer.stage("keypoints and matching"):
             matches = match_images(
-                *rgb,
+                rgb[0],
+                rgb[1],
                 detector,
                 selection=whole,
                 ignore=masks,
@@ -211,7 +212,8 @@ def estimate_pose(
     timer = StageTimer(progress)
     with timer.stage("keypoints and matching"):
         matches = match_images(
-            *rgb,
+            rgb[0],
+            rgb[1],
             detector,
             ignore=masks,
             model="fundamental",

@@ -157,7 +157,7 @@ def _adjust(
 
 
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
-    gray = luma(np.ascontiguousarray(image[:, :, :3]))
+    gray = luma(image)
     if not hasattr(detector, "heatmap"):
         if isinstance(detector, PointDetector):
             points = detector.extract(image)
