@@ -433,7 +433,7 @@ def _from_pil(
 
 
 def _alpha_of(image: Any) -> np.ndarray | None:
-    """Return the alpha of a loaded PIL image of 8 bits, (H, W) uint8, or None if it has none."""
+    """Return the alpha of a loaded PIL image of 8 bits, (H, W) uint8, or None."""
     if image.mode in ("RGBa", "La"):
         image = image.convert(image.mode.upper())
     elif "transparency" in image.info and image.mode in ("1", "L", "P", "RGB"):

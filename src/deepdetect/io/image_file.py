@@ -87,7 +87,7 @@ HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
 @suggest_keywords
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How image files are read; the fields are parameters of `load_image`, but for the last.
+    """How image files are read; the fields other than the last are parameters of `load_image`.
 
     `deep_range` is the range of uint16 images that state none, common to the images of a call.
     """
