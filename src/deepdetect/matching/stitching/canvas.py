@@ -75,7 +75,7 @@ class Canvas:
         return right, bottom
 
     def check_size(self, max_megapixels: float) -> None:
-        """Raise an OptionError if the canvas is empty, too large, or needs too much memory."""
+        """Raise an OptionError if the canvas is empty or too large, or needs too much memory."""
         width, height = self.size
         if not (width and height):
             raise OptionError("at this `scale` the panorama has no pixel: make it larger")
