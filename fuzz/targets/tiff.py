@@ -93,10 +93,12 @@ def expected_rgb(
         nodata = own.tags.get(42113)
         orientation = own.tags.get(274)
         colormap = own.colormap
+        extra = [int(each) for each in own.extrasamples]
+        alpha = values[:, :, extra.index(2) - len(extra)] if 2 in extra else None
         colours = 3 if photometric == "RGB" else values.shape[2] - (values.shape[2] in (2, 4))
     values = values[:, :, [each - 1 for each in bands]] if bands else values[:, :, :colours]
     absent = np.zeros(values.shape, bool)
-    if nodata is not None and float(nodata.value) != 0:
+    if nodata is not None:
         absent = values == float(nodata.value)
     exact = np.where(absent, 0, values).astype(np.float64)
     if photometric == "PALETTE":
@@ -109,7 +111,13 @@ def expected_rgb(
         rgb = np.rint(level) if value_range or dtype.kind == "f" else np.floor(level + 0.5)
         rgb = 255 - rgb if photometric == "MINISWHITE" else rgb
     rgb = np.repeat(rgb, 3, axis=2) if rgb.shape[2] == 1 else rgb
-    rgb = np.where(absent.any(axis=2)[..., None], 0, rgb)
+    share = np.ones(rgb.shape[:2])
+    if alpha is not None:
+        share = alpha / (255 if alpha.dtype == np.uint8 else max(alpha.max(initial=0), 1))
+    share = np.where(absent.any(axis=2), 0, share).clip(0, 1)
+    if (share >= 0.5).any():  # otherwise alpha tells nothing
+        share = np.where(share < 0.5, 0, share)[..., None]
+        rgb = np.rint(rgb * share + 128 * (1 - share))
     turns = {1: (0, 0), 2: (0, 1), 3: (2, 0), 4: (2, 1), 5: (1, 2), 6: (3, 0), 7: (3, 2), 8: (1, 0)}
     turn, flip = turns[int(orientation.value) if orientation else 1]
     if flip == 2:  # transposed

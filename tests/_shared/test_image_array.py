@@ -15,7 +15,7 @@ def test_channels_may_come_first(count: int) -> None:
     last = np.random.default_rng(0).integers(0, 256, (20, 30, count), np.uint8)
     np.testing.assert_array_equal(array_to_rgb(np.moveaxis(last, 2, 0)), array_to_rgb(last))
     # 3x5 pixels with the channels last are no channels first.
-    assert array_to_rgb(np.zeros((3, 5, count), np.uint8)).shape == (3, 5, 3)
+    assert array_to_rgb(np.full((3, 5, count), 255, np.uint8)).shape == (3, 5, 3)
 
 
 def test_bgr_is_what_opencv_calls_it(photo: np.ndarray) -> None:

@@ -122,7 +122,7 @@ def test_nobody_holds_the_image_while_keypoints_are_selected(
     images: list[weakref.ref[np.ndarray]] = []
     held = []
 
-    def load(_: object, **__: object) -> np.ndarray:
+    def load(*_: object) -> np.ndarray:
         rgb = photo[:64, :96].copy()
         images.append(weakref.ref(rgb))
         return rgb
@@ -132,7 +132,7 @@ def test_nobody_holds_the_image_while_keypoints_are_selected(
         return select_from_maps(*args)
 
     monkeypatch.setattr(heatmap, "MAX_AUTO_PIXELS", 2048)
-    monkeypatch.setattr(detector_module, "load_image", load)
+    monkeypatch.setattr(detector_module, "load_pixels", load)
     monkeypatch.setattr(detector_module, "select_from_maps", select)
     found = DeepDetect(backend="onnxruntime", resolution=resolution).detect("photo.jpg")
     assert len(found) > 100

@@ -22,6 +22,9 @@ RNG = np.random.default_rng(7)
 RGB = RNG.integers(0, 256, (18, 25, 3), dtype=np.uint8)
 GREY = RGB[:, :, 0]
 ALPHA = RNG.integers(0, 256, (18, 25, 1), dtype=np.uint8)
+CUT_OUT = np.rint(
+    np.where(ALPHA < 127.5, 128, RGB * (ALPHA / 255) + 128 * (1 - ALPHA / 255))
+).astype(np.uint8)
 OPAQUE = np.full((18, 25, 1), 255, np.uint8)
 DEEP = RNG.integers(0, 65536, (18, 25), dtype=np.uint16)
 DEEP_RGB = RNG.integers(0, 65536, (18, 25, 3), dtype=np.uint16)
@@ -39,7 +42,8 @@ def shallow(deep: np.ndarray) -> np.ndarray:
 ARRAYS = {
     "rgb": (RGB, RGB),
     "grey": (GREY, triple(GREY)),
-    "rgba": (np.dstack([RGB, ALPHA]), RGB),
+    "rgba": (np.dstack([RGB, ALPHA]), CUT_OUT),
+    "opaque": (np.dstack([RGB, OPAQUE]), RGB),
     "fortran order": (np.asfortranarray(RGB), RGB),
     "uint16 grey": (DEEP, triple(shallow(DEEP))),
     "uint16 rgb": (DEEP_RGB, shallow(DEEP_RGB)),
@@ -53,7 +57,7 @@ ARRAYS = {
     ),
     "float32 grey": ((GREY / 255).astype(np.float32), triple(GREY)),
     "float64 rgb": (RGB / 255, RGB),
-    "float16 rgba": ((np.dstack([RGB, ALPHA]) / 255).astype(np.float16), RGB),
+    "float16 rgba": ((np.dstack([RGB, OPAQUE]) / 255).astype(np.float16), RGB),
     "float a little below a level": ((GREY - 0.4).clip(0) / 255, triple(GREY)),
     "float a little above a level": ((GREY + 0.4).clip(0, 255) / 255, triple(GREY)),
     "bool grey": (GREY > 99, triple(np.where(GREY > 99, 255, 0))),
@@ -77,8 +81,8 @@ PALETTE = Image.fromarray(RGB).quantize(16)
 PIL_IMAGES = {
     "RGB": (Image.fromarray(RGB), RGB),
     "L": (Image.fromarray(GREY), triple(GREY)),
-    "RGBA": (Image.fromarray(np.dstack([RGB, ALPHA])), RGB),
-    "LA": (Image.fromarray(np.dstack([GREY, ALPHA])), triple(GREY)),
+    "RGBA": (Image.fromarray(np.dstack([RGB, ALPHA])), CUT_OUT),
+    "LA": (Image.fromarray(np.dstack([GREY, OPAQUE])), triple(GREY)),
     "P": (PALETTE, np.array(PALETTE.getpalette(), np.uint8).reshape(-1, 3)[np.asarray(PALETTE)]),
     "1": (Image.fromarray(GREY > 99), triple(np.where(GREY > 99, 255, 0))),
     "La": (Image.fromarray(np.dstack([GREY, OPAQUE])).convert("La"), triple(GREY)),
@@ -127,8 +131,9 @@ def test_file_formats(suffix: str, exact: bool, photo: np.ndarray, tmp_path: Pat
 def test_palette_with_transparency_loads_in_silence(tmp_path: Path) -> None:
     # Pillow warns about such files, which are common; a warning is an error in these tests.
     path = tmp_path / "palette.png"
-    PALETTE.save(path, transparency=bytes(range(16)))
-    np.testing.assert_array_equal(load_image(path), PIL_IMAGES["P"][1])
+    PALETTE.save(path, transparency=bytes([0] * 4 + [255] * 12))
+    expected = np.where(np.asarray(PALETTE)[..., None] < 4, 128, PIL_IMAGES["P"][1])
+    np.testing.assert_array_equal(load_image(path), expected)
 
 
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {

@@ -133,11 +133,18 @@ def test_bands_are_chosen(planes: str) -> None:
 
 def test_colours_beside_alpha_and_other_samples() -> None:
     extra = RNG.integers(0, 256, (20, 30, 2), dtype=np.uint8)
-    for more in (extra[:, :, :1], extra):
-        content = written(np.dstack([COLOUR, more]), photometric="rgb")
+    for more, kinds in ((extra[:, :, :1], ["unspecified"]), (extra, ["unspecified"] * 2)):
+        content = written(np.dstack([COLOUR, more]), photometric="rgb", extrasamples=kinds)
         np.testing.assert_array_equal(load_image(content), COLOUR)
-    grey = written(np.dstack([GREY, GREY]), photometric="minisblack", extrasamples=["unassalpha"])
-    np.testing.assert_array_equal(load_image(grey), triple(GREY))
+    for kind, white in (("unassalpha", 200), ("assocalpha", 100)):
+        alpha = np.where(np.arange(30) < 9, 0, 255).astype(np.uint8) * np.ones((20, 1), np.uint8)
+        alpha[0, 20] = 128
+        shade = np.full_like(GREY, 200)
+        shade[0, 20] = white  # as stored; both are a little over half of 200 on grey
+        grey = written(np.dstack([shade, alpha]), photometric="minisblack", extrasamples=[kind])
+        expected = np.where(alpha == 0, 128, 200)
+        expected[0, 20] = round(200 * 128 / 255 + 128 * 127 / 255)
+        assert np.abs(load_image(grey).astype(int) - triple(expected)).max() <= 1
 
 
 def test_white_is_zero_and_palettes() -> None:
@@ -203,12 +210,12 @@ def test_previews_and_pyramids_are_no_pages() -> None:
     assert page_numbers(file.getvalue()) == [0]
 
 
-def test_what_is_no_data_is_black() -> None:
+def test_what_is_no_data_is_grey() -> None:
     values = DEEP[:, :, 0] / np.float32(65535)
     values[:4] = -9999
     content = written(values, extratags=[(42113, "s", 0, "-9999", True)])
     found = load_image(content)
-    assert not found[:4].any()
+    assert (found[:4] == 128).all()
     np.testing.assert_array_equal(found[4:], load_image(values[4:]))
     values[:4] = np.nan
     content = written(values, extratags=[(42113, "s", 0, "nan", True)])

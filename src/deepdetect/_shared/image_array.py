@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 
+from .alpha import on_grey
 from .errors import ImageError, check_name
+from .value_range import range_of_uint16, tell_if_little
 
 Channels = Literal["rgb", "bgr"]
 CHANNEL_COUNTS = (1, 3, 4)
-
-SENSOR_BITS = (8, 10, 12, 14, 16)
-"""Bit depths of sensors. A uint16 image is assumed to have the smallest that holds its values."""
-
-LITTLE_RANGE = 1 / 8
-"""An image whose largest value is less than this fraction of white causes a warning, because it is
-nearly black. Chosen by hand."""
 
 
 def check_channels(channels: str) -> None:
@@ -48,7 +42,12 @@ def as_array(image: Any) -> np.ndarray:
         raise ImageError("an image array must have rows of equal length") from None
 
 
-def array_to_rgb(
+def array_to_rgb(image: Any, channels: Channels = "rgb", **options: Any) -> np.ndarray:
+    """Convert an array or tensor to RGB like `array_to_pixels`, but always to three channels."""
+    return np.ascontiguousarray(array_to_pixels(image, channels, **options)[:, :, :3])
+
+
+def array_to_pixels(
     image: Any,
     channels: Channels = "rgb",
     name: str = "the image",
@@ -58,7 +57,7 @@ def array_to_rgb(
     white: int | None = None,
     deep: bool = False,
 ) -> np.ndarray:
-    """Convert an array or PyTorch tensor to an (H, W, 3) RGB image.
+    """Convert an array or PyTorch tensor to an (H, W, 3) RGB image, or (H, W, 4) as in `alpha`.
 
     The result is uint8 or, if `deep` is set and the input has more than 8 bits, uint16. `white` is
     the value of white in an unsigned image, if known. `name` is the image's name in messages. The
@@ -76,11 +75,18 @@ def array_to_rgb(
     if array.dtype.kind not in "buif":
         raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
     if value_range is None:
-        value_range = _range_of(array, name, white)
+        colours = array[:, :, :3] if array.ndim == 3 else array
+        value_range = _range_of(colours, name, white)
     values = _in_range(array, value_range, name, deep)
     if values.ndim == 2:
         return np.repeat(values[:, :, None], 3, axis=2)
-    return np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
+    rgb = np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
+    if array.shape[2] < 4:
+        return rgb
+    alpha = array[:, :, 3]
+    # The largest alpha of a deep image is opaque, since sensors of 12 bits may end at 4095.
+    opaque = 255 if array.dtype == np.uint8 else max(alpha.max(), 1)
+    return on_grey(rgb, alpha, opaque, name)
 
 
 def deep_values(image: Any) -> np.ndarray:
@@ -90,9 +96,16 @@ def deep_values(image: Any) -> np.ndarray:
     return values.astype(np.uint16) if of_16_bits else values
 
 
-def to_8_bits(rgb: np.ndarray) -> np.ndarray:
-    """Convert a uint8 or uint16 image to uint8."""
-    return rgb if rgb.dtype == np.uint8 else _in_range(rgb, (0, 65535), "", False)
+def to_8_bits(rgb: np.ndarray, value_range: Sequence[float] = (0, 65535)) -> np.ndarray:
+    """Convert a uint8 or uint16 image to uint8; the range is that of a uint16 image."""
+    return rgb if rgb.dtype == np.uint8 else _in_range(rgb, value_range, "", False)
+
+
+def from_16_bits(image: np.ndarray, value_range: Sequence[float]) -> np.ndarray:
+    """Turn uint16 pixels, read with this range, back into the values of their image, uint16."""
+    low, high = value_range
+    levels = np.arange(65536) * ((high - low) / 65535) + low
+    return np.rint(levels.clip(0, 65535)).astype(np.uint16)[image]
 
 
 def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
@@ -152,9 +165,9 @@ def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, f
     if kind == "u" and size == 1:
         return 0, white or 255
     if kind == "u" and size == 2:
-        largest = int(array.max(initial=0))
-        white = white or 2 ** next(bits for bits in SENSOR_BITS if largest < 2**bits) - 1
-        _tell_if_dark(largest / white, name)
+        if white is None:
+            return range_of_uint16(array, name)
+        tell_if_little(int(array.max(initial=0)) / white, name)
         return 0, white
     if kind == "f":
         low, high = (float(array.min()), float(array.max())) if array.size else (0.0, 1.0)
@@ -162,18 +175,12 @@ def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, f
             raise ImageError(
                 f"{name} spans [{low:g}, {high:g}]: scale floats to [0, 1], or give `value_range`"
             )
-        _tell_if_dark(high, name)
+        tell_if_little(high, name)
         return 0, 1
     raise ImageError(
         f"{name} is {array.dtype}, whose range is unknown: give `value_range`, or convert it to "
         "uint8, uint16, or float in [0, 1]"
     )
-
-
-def _tell_if_dark(used: float, name: str) -> None:
-    if 0 < used < LITTLE_RANGE:
-        used_range = f"{name} uses {used:.1%} of its range, and is nearly black"
-        warnings.warn(f"{used_range}: give the range by `value_range`", UserWarning, stacklevel=2)
 
 
 def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:

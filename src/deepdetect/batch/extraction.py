@@ -24,8 +24,8 @@ from ..detector.point_detector import PointDetector
 from ..features.keypoints import UNSET_ANGLE, Keypoints, unit_length
 from ..features.selection import SelectionOptions
 from ..features.sift import ROOT_SIFT, describe_keypoints
-from ..io.image import find_images, load_image, luma
-from ..io.image_file import ReadingOptions, reading_options
+from ..io.image import find_images, load_visible, luma, one_range
+from ..io.image_file import ReadingOptions, read_with, reading_options
 from .hdf5 import SETTINGS, BatchReport, Group, Item, State, damaged, fill_file
 
 ROOT_SIFT_NORM = 512
@@ -98,7 +98,9 @@ def extract_features(
     root = Path(folder).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
     utf8 = [name for name in names if name == name.encode("utf-8", "ignore").decode()]
-    reading = reading_options(max_megapixels=max_megapixels)
+    limited = reading_options(max_megapixels=max_megapixels)
+    with read_with(limited), one_range([root / name for name in utf8]) as reading:
+        pass
     settings = {
         **detector.settings,
         **reading.settings,
@@ -141,9 +143,10 @@ def _extract(
 ) -> Iterator[Group]:
     for name, state in images:
         with noted_failures(name, failures):
-            rgb = load_image(root / name, **vars(reading))
+            with read_with(reading):
+                rgb, hidden = load_visible(root / name)
             gray = luma(rgb)
-            keypoints = find_keypoints(detector, rgb, selection)
+            keypoints = find_keypoints(detector, rgb, selection, hidden)
             if isinstance(detector, PointDetector):
                 keypoints = detector.describe(rgb, keypoints)
             else:

@@ -20,7 +20,7 @@ from ..detector.detector import DeepDetect, find_keypoints
 from ..detector.point_detector import PointDetector
 from ..features.pictures import draw_best_keypoints, draw_dense_keypoints
 from ..features.selection import SelectionOptions, select_keypoints
-from ..io.image import load_image
+from ..io.image import load_visible, one_range
 from ..io.image_file import reading_options
 from ..io.masks import load_mask
 from ..io.picture_file import save_picture
@@ -77,7 +77,8 @@ def detect(
     work.say_what_is_replaced(outputs)
     results: list[dict[str, Any]] = []
     failures: list[str] = []
-    with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
+    quiet = len(paths) == 1
+    with one_range(paths), progress(len(paths), "detecting", "image", quiet=quiet) as bar:
         for path, files in outputs.items():
             with noted_failures(str(path), failures):
                 results.append(work.detect(path, files))
@@ -144,14 +145,14 @@ class _Work:
             return {"image": path, **done["numbers"], **shown, "skipped": True}
         earlier = None if self.overwrite else Outputs([files["file"]], [path]).find()
         started = time.perf_counter()
-        rgb = load_image(path)
+        rgb, mask = load_visible(path, ignore=self.mask)
         if "dense" in files and isinstance(self.detector, DeepDetect):
             # Both maps come from one call, so that the network runs only once.
             heatmap, logits = self.detector.heatmap_and_logits(rgb)
             selection = self.selection or SelectionOptions()
-            keypoints = select_keypoints(heatmap, selection, logits, ignore=self.mask)
+            keypoints = select_keypoints(heatmap, selection, logits, ignore=mask)
         else:
-            keypoints = find_keypoints(self.detector, rgb, self.selection, self.mask)
+            keypoints = find_keypoints(self.detector, rgb, self.selection, mask)
         seconds = time.perf_counter() - started
         numbers = {
             "width": keypoints.image_size[0],

@@ -25,7 +25,7 @@ from ..features.selection import SelectionOptions
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
-from ..io.image import load_image
+from ..io.image import load_image, load_pixels, one_range
 from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_picture
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
@@ -119,10 +119,11 @@ def match(
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
     stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
-    load = lru_cache(2)(load_image)  # successive pairs share an image
+    load = lru_cache(2)(load_pixels)  # successive pairs share an image
     found: list[dict[str, Any]] = []
     failures: list[str] = []
-    with progress(len(outputs), "matching", "pair", quiet=not many) as bar:
+    seen = [*dict.fromkeys(inputs)]
+    with one_range(seen), progress(len(outputs), "matching", "pair", quiet=not many) as bar:
         for pair, files in outputs.items():
             name = " ".join(map(str, pair)) if many else ""
             with noted_failures(name, failures):
@@ -307,7 +308,10 @@ def register(
             if files[path].suffix == ".tif":
                 kept.write_tiff(bands, made[path])
             else:
-                rgb = found.warped if path == image1 else array_to_rgb(bands, deep=True)
+                every = (0, 65535) if bands.dtype == np.uint16 else None  # keeps their numbers
+                rgb = array_to_rgb(bands[:, :, :3], value_range=every, deep=True)
+                rgb[(bands[:, :, 3:] == 0).any(axis=2)] = 0  # transparent
+                rgb = found.warped if path == image1 else rgb
                 save_picture(rgb, made[path], kept)
             kept.write_beside(files[path])
         save_picture(found.checkerboard(), made["_checkerboard.png"])
@@ -392,8 +396,12 @@ def stitch(
                 text = text.replace(f"images[{number}]", str(path))
             raise type(error)(text) from error
         moved = panorama.homographies[panorama.reference] if flat else None
-        kept = replace(carried[panorama.reference], no_data=None).moved(moved)
-        save_picture(panorama.image, made["file"], kept)
+        kept, image = carried[panorama.reference].moved(moved), panorama.image
+        if kept.no_data is not None and kept.no_data in range(np.iinfo(image.dtype).max + 1):
+            image = np.where(panorama.valid[..., None], image, image.dtype.type(kept.no_data))
+        else:
+            kept = replace(kept, no_data=None)
+        save_picture(image, made["file"], kept)
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
         cli.say(f"{images[number]} is not in the panorama: {reason}")

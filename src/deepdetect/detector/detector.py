@@ -21,7 +21,17 @@ from ..features.selection import (
     select_keypoints,
 )
 from ..features.sift import describe_keypoints
-from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
+from ..io.image import (
+    Images,
+    batch_length,
+    ignore_masks,
+    image_named,
+    load_each,
+    load_image,
+    load_pixels,
+    load_visible,
+    luma,
+)
 from .backends import RuntimeOptions, open_network
 from .heatmap import HeatmapOptions, compute_maps, memory_named
 from .pretrained import PRETRAINED, resolve_weights
@@ -251,7 +261,7 @@ class DeepDetect:
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        return self._select(load_image(image, channels=channels), options, ignore)
+        return self._select(load_pixels(image, channels), options, ignore)
 
     @suggest_keywords
     def detect_batch(
@@ -314,7 +324,7 @@ class DeepDetect:
             ImageError: the image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
-        rgb = load_image(image, channels=channels)
+        rgb = load_pixels(image, channels)
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
         return describe_keypoints(luma(rgb), self._select(rgb, options, ignore))
 
@@ -323,6 +333,7 @@ class DeepDetect:
     ) -> Keypoints:
         if options.max_keypoints is None:
             options = replace(options, max_keypoints=self.max_keypoints)
+        rgb, ignore = load_visible(rgb, ignore=ignore)
         with memory_named(rgb.shape):
             maps = compute_maps(rgb, self._network, self.heatmap_options)
             del rgb  # frees memory for the keypoints
@@ -350,12 +361,13 @@ def find_keypoints(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | None = None,
 ) -> Keypoints:
-    """Find the keypoints of a (H, W, 3) uint8 image with any detector.
+    """Find the keypoints of a (H, W, 3) or (H, W, 4) uint8 image with any detector.
 
     A detector is any object with a method `detect` or `heatmap` like those of this package. If
     the detector has heat maps, `selection` chooses their pixels; None: pixels above 0.5.
     """
     check_selection(detector, selection)
+    rgb, ignore = load_visible(rgb, ignore=ignore)
     if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):
         raise OptionError(f"the detector {detector!r} has no method detect: use a DeepDetect")
     if hasattr(detector, "detect") and not hasattr(detector, "heatmap"):

@@ -18,7 +18,17 @@ from ..features.keypoints import Keypoints
 from ..features.learned import LEARNED
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import ROOT_SIFT, describe_keypoints
-from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
+from ..io.image import (
+    Images,
+    batch_length,
+    ignore_masks,
+    image_named,
+    load_each,
+    load_image,
+    load_pixels,
+    load_visible,
+    luma,
+)
 from .backends.interface import RuntimeOptions
 from .heatmap import MAX_AUTO_PIXELS, memory_named
 from .points.descriptor import DESCRIPTOR_GRAPHS, describe_learned, descriptor_type
@@ -154,7 +164,7 @@ class PointDetector:
             ImageError: the image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
-        return self._find(load_image(image, channels=channels), ignore, max_keypoints)
+        return self._find(load_pixels(image, channels), ignore, max_keypoints)
 
     @suggest_keywords
     def detect_batch(
@@ -208,7 +218,7 @@ class PointDetector:
             OptionError: the mask has another size than the image.
             WeightsError: the ONNX file of the descriptor is damaged.
         """
-        rgb = load_image(image, channels=channels)
+        rgb = load_pixels(image, channels)
         return self.describe(rgb, self._find(rgb, ignore, max_keypoints))
 
     @suggest_keywords
@@ -248,6 +258,7 @@ class PointDetector:
     ) -> Keypoints:
         check_max_keypoints(max_keypoints)
         most = self.max_keypoints if max_keypoints is None else int(max_keypoints)
+        rgb, ignore = load_visible(rgb, ignore=ignore)
         gray = luma(rgb)
         height, width = gray.shape
         if ignore is not None:

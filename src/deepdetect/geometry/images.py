@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._shared.alpha import continued
 from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
@@ -61,25 +62,46 @@ def warp_to_reference(
     return warped, cv2.warpPerspective(whole, homography, size, flags=nearest) > 0
 
 
+def warp_visible(
+    pixels: np.ndarray, homography: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Warp an image as `warp_to_reference` does, if it has transparent pixels, to RGB."""
+    warped, valid = warp_to_reference(continued(pixels), homography, size)
+    return without_touched(warped, valid)
+
+
+def without_touched(warped: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return RGB of a warped image, and its mask without pixels that transparent ones touch."""
+    if warped.shape[2] == 3:
+        return warped, mask
+    known = warped[:, :, 3] >= np.iinfo(warped.dtype).max * (1 - MAX_UNKNOWN_WEIGHT)
+    return np.ascontiguousarray(warped[:, :, :3]), mask * known
+
+
 def warp_bands(
     bands: np.ndarray,
     homography: np.ndarray,
     size: tuple[int, int],
     no_data: float | None = None,
+    hidden: np.ndarray | None = None,
 ) -> np.ndarray:
     """Warp an image of C bands, (H, W, C) of any type of number, as `warp_to_reference` does.
 
-    A pixel has no data if any of its bands has the value `no_data`. Pixels of the result that
-    depend on such a pixel, or lie outside the image, become `no_data`, or 0 if that is None.
+    A pixel has no data if any of its bands is `no_data` or NaN, or if it is `hidden`. Pixels of the
+    result that depend on such a pixel, or lie outside the image, become `no_data`. If that is None,
+    they become NaN if there are NaN, or else 0.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:
         no_data = None
-    known = np.ones(bands.shape[:2], bool)
-    if no_data is not None:
-        known = ~((bands == no_data) | (np.isnan(no_data) & np.isnan(bands))).any(axis=2)
+    absent = np.isnan(bands)
+    if no_data is None:
+        no_data = np.nan if absent.any() else None
+    else:
+        absent |= bands == no_data
+    known = ~absent.any(axis=2) if hidden is None else ~(absent.any(axis=2) | hidden)
     weight, valid = warp_to_reference(known.astype(np.float32), homography, size)
-    if no_data is not None:
+    if not known.all():
         valid &= np.abs(weight - 1) < MAX_UNKNOWN_WEIGHT
     planes = []
     for band in np.moveaxis(bands, 2, 0):

@@ -9,26 +9,33 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from .._shared.alpha import on_grey, opaque_part
 from .._shared.errors import ImageError, MissingImageError, OptionError
-from .._shared.image_array import Channels, array_to_rgb, check_channels, deep_values
+from .._shared.image_array import Channels, array_to_pixels, check_channels, deep_values
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import was_made
+from .._shared.value_range import find_range, range_of_call
+from ..features.selection import check_ignore
 from .companions import holds_image, tell_left_out, without_masks
 from .image_file import (
     IMAGE_SUFFIXES,
+    PNG_SIGNATURE,
     RAW_SUFFIXES,
     ReadingOptions,
     damaged_image,
     file_name,
     is_file,
+    is_path,
     open_file,
     open_image,
+    read_with,
     reading_options,
 )
 from .tiff import TIFF_STARTS, page_numbers, read_tiff
@@ -38,6 +45,12 @@ Images = list[Any] | tuple[Any, ...] | np.ndarray
 
 MINIMUM_SIDE = 16
 """Images must be at least this many pixels wide and high. Chosen by hand."""
+
+SEEN_IMAGES = 8
+"""The common range of many deep images is found from this many, because reading all would take
+twice the time. Chosen by hand."""
+
+ALL_VALUES = (0, 65535)
 
 ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26
@@ -76,8 +89,9 @@ def load_image(
         image: a path; the content of an image file as bytes, or a file opened in binary mode,
             which is read from its beginning; a PIL image; or an array or a PyTorch tensor
             (H, W), (H, W, C) or (C, H, W) of 1, 3 or 4 channels: uint8, uint16 or float in [0, 1].
-            The fourth channel, alpha, is dropped. Files, also given as bytes, are turned upright
-            according to their EXIF orientation.
+            Files, also given as bytes, are turned upright according to their EXIF orientation.
+            Transparent pixels (alpha, a transparent palette entry, GDAL's no-data value or mask,
+            NaN in a TIFF file) are blended with grey, and hold no keypoints in any method.
         channels: order of the colours in an array or a tensor: "bgr" for images of `cv2.imread`
             and `cv2.VideoCapture`. It does not apply to files and PIL images.
         max_megapixels: size limit of image files: larger ones are rejected before decoding, since
@@ -86,7 +100,10 @@ def load_image(
             WebP files of at most 178 megapixels (`PIL.Image.MAX_IMAGE_PIXELS`).
         value_range: the values of black and of white, such as (0, 4095) for a 12-bit sensor. None:
             the values that the file states. If it states none, they are 0 and 1 for floats, and for
-            uint16 0 and the smallest of 255, 1023, 4095, 16383 and 65535 that no pixel exceeds.
+            uint16 0 and the smallest of 255, 1023, 4095, 16383 and 65535 that no pixel exceeds,
+            without hot pixels (at most one in a thousand) and padding with 65535. A narrow band
+            of uint16 values far from 0, as of a thermal camera, is spread over the grey levels,
+            with a warning. Methods that take several images read them with one common range.
             Integers that are neither uint8 nor uint16 need this option.
         bands: numbers, from 1, of the three bands of a TIFF file or array that become red, green
             and blue: (4, 3, 2) for Landsat 8. None: the first three. Images of four bands without
@@ -118,15 +135,72 @@ def load_image(
         page=page,
         allow_truncated=allow_truncated,
     )
-    return _load(image, channels, options, value_range=value_range, bands=bands)
+    return opaque_part(_load(image, channels, options, value_range=value_range, bands=bands))[0]
 
 
-def load_deep(image: Any, channels: Channels, *, raw: bool = False) -> np.ndarray:
-    """Read an image like `load_image`, but as uint16 if it has more than 8 bits per channel.
+def load_pixels(
+    image: Any, channels: Channels = "rgb", *, deep: bool = False, raw: bool = False
+) -> np.ndarray:
+    """Read an image like `load_image`, with a fourth channel, as in `alpha`, if it is transparent.
 
-    If `raw`, arrays and TIFF files keep all their bands, (H, W, C), in their own data type.
+    If `deep`, images with more than 8 bits per channel become uint16. If `raw`, arrays and files
+    keep their numbers, and arrays and TIFF files all their bands, (H, W, C).
     """
-    return _load(image, channels, reading_options(), deep=True, raw=raw)
+    return _load(image, channels, reading_options(), deep=deep, raw=raw)
+
+
+def load_visible(
+    image: Any, channels: Channels = "rgb", ignore: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read an image like `load_image`; return it, and the mask `ignore` with transparent pixels."""
+    rgb, hidden = opaque_part(load_pixels(image, channels))
+    if hidden is None or ignore is None:
+        return rgb, ignore if hidden is None else hidden
+    return rgb, hidden | check_ignore(ignore, hidden.shape)
+
+
+def load_pair(
+    images: tuple[Any, Any], channels: Channels, ignore: Any = None
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray | None, np.ndarray | None]]:
+    """Load two images with one range; return both images, and both masks of `load_visible`."""
+    masks = ignore_masks(ignore, 2)
+    with one_range(images, channels):
+        first, mask0 = load_visible(images[0], channels, masks[0])
+        second, mask1 = load_visible(images[1], channels, masks[1])
+    return (first, second), (mask0, mask1)
+
+
+@contextmanager
+def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOptions]:
+    """Read the uint16 images of a call with one range in the block; yield the options of reading.
+
+    The range is that of all images together, or of `SEEN_IMAGES` of a longer list at equal steps,
+    if the first may be of this kind. Open files and pipes, which may be readable once, are not.
+    """
+    options, counts = reading_options(), np.zeros(1 << 16, np.int64)
+    seen = images[:: -(-len(images) // SEEN_IMAGES) or 1] if options.deep_range is None else ()
+    for image in seen:
+        with suppress(Exception), range_of_call(counts), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if _may_be_deep(image):
+                _load(image, channels, options)
+        if not counts.any():
+            break
+    if counts.any():
+        options = replace(options, deep_range=find_range(counts, file_name(images[0])))
+    with read_with(options):
+        yield options
+
+
+def _may_be_deep(image: Any) -> bool:
+    """Return whether an image may have 16 bits per channel, by the first bytes of a file."""
+    if is_path(image) and Path(image).is_file():
+        with open(image, "rb") as file:
+            image = file.read(HEADER_BYTES)
+    if isinstance(image, (bytes, bytearray)):
+        png = image[:4] == PNG_SIGNATURE[:4] and image[24] == 16
+        return png or image[:4] in TIFF_STARTS or image[4:6] == b"jP"  # JPEG 2000
+    return not is_file(image) and getattr(image, "dtype", None) != np.uint8
 
 
 def _load(
@@ -143,11 +217,11 @@ def _load(
     elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
         if for_arrays.get("bands") is not None:
             raise OptionError("`bands` need a TIFF file or an array: leave them out")
-        rgb = _from_pil(image, "the image", for_arrays.get("value_range"), deep)
+        rgb = _from_pil(image, "the image", for_arrays.get("value_range"), deep, raw)
     elif raw and isinstance(image, np.ndarray) and image.ndim in (2, 3):
         rgb = image.reshape(*image.shape[:2], -1)
     else:
-        rgb = array_to_rgb(image, channels, deep=deep, **for_arrays)
+        rgb = array_to_pixels(image, channels, deep=deep, **for_arrays)
     height, width = rgb.shape[:2]
     if min(height, width) < MINIMUM_SIDE:
         raise ImageError(
@@ -160,11 +234,13 @@ def _load(
 def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
     """Load the images of a list, tuple or batch one by one; yield the index and pixels of each."""
     batch_length(images)
+    with one_range(images, channels) as reading:
+        pass
     for number, image in enumerate(images):
-        with image_named(number):
-            rgb = load_image(image, channels=channels)
-        yield number, rgb
-        del rgb
+        with image_named(number), read_with(reading):
+            pixels = load_pixels(image, channels)
+        yield number, pixels
+        del pixels
 
 
 def batch_length(images: Images) -> int:
@@ -185,6 +261,14 @@ def image_named(number: int) -> Iterator[None]:
         raise type(error)(f"images[{number}]: {error}") from None
 
 
+def at_pixels(mask: np.ndarray | None, xy: np.ndarray) -> np.ndarray:
+    """Return, (N,) bool, at which of (N, 2) positions a mask of `load_visible` is true."""
+    if mask is None:
+        return np.zeros(len(xy), bool)
+    columns, rows = np.rint(xy).clip(0, np.subtract(np.shape(mask)[::-1], 1)).astype(np.intp).T
+    return np.asarray(mask)[rows, columns] != 0
+
+
 def ignore_masks(ignore: Any, images: int) -> list[Any]:
     """Return the ignore mask of each image, from one mask for all images or a list of masks."""
     if not (isinstance(ignore, (list, tuple)) or getattr(ignore, "ndim", 2) == 3):
@@ -195,8 +279,8 @@ def ignore_masks(ignore: Any, images: int) -> list[Any]:
 
 
 def luma(rgb: np.ndarray) -> np.ndarray:
-    """Return the 8-bit luma (ITU-R BT.601) of a (H, W, 3) uint8 RGB image as (H, W) uint8."""
-    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    """Return the 8-bit luma (ITU-R BT.601) of a uint8 image of 3 or 4 channels, (H, W) uint8."""
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY if rgb.shape[2] == 3 else cv2.COLOR_RGBA2GRAY)
 
 
 def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
@@ -280,9 +364,9 @@ def _read_file(
         else:
             with open_image(file, options=options) as image:
                 if image.format == "PNG" and start[24] == 16 and start[25] != GREY_PNG:
-                    rgb = _deep_png(file, name, options, deep)
+                    rgb = _deep_png(file, name, options, deep, raw)
                 else:
-                    rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
+                    rgb = _from_pil(image, name, options.value_range, deep, raw)
                 orientation, several = orientation_of(image), hasattr(image, "n_frames")
             del image  # frees its pixels before `UPRIGHT` makes another copy
         pages: list[int] = []
@@ -291,16 +375,29 @@ def _read_file(
     if len(pages) > 1:
         text = f"{name} holds {len(pages)} images, of which one is taken: choose it by `page`"
         warnings.warn(text, UserWarning, stacklevel=4)
+    if is_path(source) and not raw and rgb.shape[2] == 3 and Path(f"{name}.msk").is_file():
+        rgb = _behind_mask(rgb, name)
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 
-def _deep_png(file: BinaryIO, name: str, options: ReadingOptions, deep: bool) -> np.ndarray:
+def _behind_mask(rgb: np.ndarray, name: str) -> np.ndarray:
+    """Make the pixels transparent that are 0 in NAME.msk, GDAL's mask beside an image file."""
+    with open_image(f"{name}.msk", what="mask") as mask:
+        shown = np.asarray(mask) != 0
+    shown = shown.reshape(*shown.shape[:2], -1).any(axis=2)
+    return on_grey(rgb, shown, 1, name) if shown.shape == rgb.shape[:2] else rgb
+
+
+def _deep_png(
+    file: BinaryIO, name: str, options: ReadingOptions, deep: bool, raw: bool
+) -> np.ndarray:
     """Read a PNG file with several channels of 16 bits, which Pillow would reduce to 8."""
     file.seek(0)
     values = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise damaged_image(name, "it cannot be decoded")
-    return array_to_rgb(values, "bgr", name, value_range=options.value_range, deep=deep)
+    value_range = ALL_VALUES if raw else options.value_range
+    return array_to_pixels(values, "bgr", name, value_range=value_range, deep=deep)
 
 
 def orientation_of(image: Any) -> Any:
@@ -316,6 +413,7 @@ def _from_pil(
     name: str,
     value_range: tuple[float, float] | None = None,
     deep: bool = False,
+    raw: bool = False,
 ) -> np.ndarray:
     try:
         image.load()
@@ -324,7 +422,11 @@ def _from_pil(
     if image.mode.startswith(("I", "F")):
         values = deep_values(image)
         white = 65535 if image.format == "PPM" else None  # Pillow scales white to this in PPM
-        return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
+        if raw and values.dtype == np.uint16:
+            value_range = ALL_VALUES
+        rgb = array_to_pixels(values, name=name, value_range=value_range, white=white, deep=deep)
+        clear = image.info.get("transparency")
+        return rgb if clear is None else on_grey(rgb, values != clear, 1, name)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
     rows = max(1, STRIP_PIXELS // max(1, width))
@@ -332,7 +434,19 @@ def _from_pil(
         bottom = min(top + rows, height)
         strip = image if rows >= height else image.crop((0, top, width, bottom))
         rgb[top:bottom] = _strip_to_rgb(strip)
-    return rgb if value_range is None else array_to_rgb(rgb, name=name, value_range=value_range)
+    if value_range is not None:
+        rgb = array_to_pixels(rgb, name=name, value_range=value_range)
+    alpha = _alpha_of(image)
+    return rgb if alpha is None else on_grey(rgb, alpha, 255, name)
+
+
+def _alpha_of(image: Any) -> np.ndarray | None:
+    """Return the alpha of a loaded PIL image of 8 bits, (H, W) uint8, or None."""
+    if image.mode in ("RGBa", "La"):
+        image = image.convert(image.mode.upper())
+    elif "transparency" in image.info and image.mode in ("1", "L", "P", "RGB"):
+        image = image.convert("RGBA")
+    return np.asarray(image.getchannel("A")) if "A" in image.getbands() else None
 
 
 def _strip_to_rgb(image: Any) -> np.ndarray:

@@ -12,8 +12,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from .._shared.alpha import on_grey
 from .._shared.errors import ImageError, MissingExtraError
-from .._shared.image_array import array_to_rgb
+from .._shared.image_array import array_to_pixels
 from .image_file import ReadingOptions, damaged_image, develop, identify, open_file
 
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -28,8 +29,7 @@ JPEG = (6, 7)
 """Codes of JPEG compression, the only compression with which YCbCr is read."""
 
 ALPHA = (1, 2)
-"""Types of extra samples that are alpha and not a band."""
-
+"""Types of extra samples that are alpha and not a band; the first has multiplied the colours."""
 ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
@@ -43,9 +43,9 @@ def read_tiff(
     """Read an image of a TIFF file.
 
     Returns:
-        (H, W, 3) RGB, not yet turned upright, and the EXIF orientation. RGB is uint8, or uint16 if
-        `deep` and the file has more than 8 bits per value. If `raw`, all bands of a grey or RGB
-        file are returned instead, (H, W, C), in their own data type.
+        (H, W, 3) RGB, or (H, W, 4) as in `alpha`, not yet turned upright, and the EXIF orientation.
+        RGB is uint8, or uint16 if `deep` and the file has more than 8 bits per value. If `raw`, all
+        bands of a grey or RGB file are returned instead, (H, W, C), in their own data type.
 
     Raises:
         ImageError: as in `load_image`.
@@ -84,7 +84,11 @@ def read_tiff(
         orientation = int(page.tags.valueof(ORIENTATION, 1))
         if raw and photometric in (MIN_IS_BLACK, RGB):
             return bands, orientation
-        return _to_rgb(bands, page, name, options, deep), orientation
+        pixels = _to_pixels(bands, page, name, options, deep)
+        masks = [each for each in stored if each.is_mask and each.shape[:2] == page.shape[:2]]
+        if masks and photometric != PALETTE and pixels.shape[2] == 3:
+            pixels = on_grey(pixels, masks[0].asarray() != 0, 1, name)
+        return pixels, orientation
 
 
 def chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
@@ -144,15 +148,15 @@ def _checked_kind(page: Any, name: str) -> int:
     return photometric
 
 
-def _to_rgb(
+def _to_pixels(
     bands: np.ndarray, page: Any, name: str, options: ReadingOptions, deep: bool
 ) -> np.ndarray:
-    """Convert (H, W, bands) values to RGB as the tags of their page define."""
+    """Convert (H, W, bands) values to RGB, or RGB and alpha, as the tags of their page define."""
     photometric = int(page.photometric)
     chosen = _chosen_bands(bands, page, name, options)
-    value, absent = no_data_of(page), None
-    if value:  # pixels with the value 0 are black already
-        absent = (chosen == value) | (np.isnan(value) & np.isnan(chosen))
+    value = no_data_of(page)
+    absent = np.isnan(chosen) | (chosen == (np.nan if value is None else value))
+    if absent.any():
         chosen = np.where(absent, chosen.dtype.type(0), chosen)
     if photometric == PALETTE:
         colours = page.colormap if page.colormap.max() < 256 else page.colormap >> 8
@@ -162,14 +166,17 @@ def _to_rgb(
 
         rgb = np.array(Image.fromarray(np.ascontiguousarray(chosen), "CMYK").convert("RGB"))
     else:
-        rgb = array_to_rgb(
+        rgb = array_to_pixels(
             chosen, name=name, value_range=options.value_range, white=_white(page), deep=deep
         )
     if photometric == MIN_IS_WHITE:
         rgb = ~rgb
-    if absent is not None:
-        rgb[absent.any(axis=2)] = 0
-    return rgb
+    alpha, opaque = ~absent.any(axis=2), 1
+    extra = [each in ALPHA for each in page.extrasamples]
+    if any(extra):  # the extra samples are the last ones
+        alpha = np.where(alpha, bands[:, :, extra.index(True) - len(extra)], 0)
+        opaque = 255 if bands.dtype == np.uint8 else max(alpha.max(), 1)
+    return on_grey(rgb, alpha, opaque, name, associated=ALPHA[0] in page.extrasamples)
 
 
 def _chosen_bands(bands: np.ndarray, page: Any, name: str, options: ReadingOptions) -> np.ndarray:
@@ -226,5 +233,7 @@ def _read_by_pillow(
         image.seek(stored.index(page))
         image.load()
         if bits == 16:
-            return array_to_rgb(np.asarray(image), name=name, value_range=options.value_range)
-        return np.asarray(image.convert("RGB"))
+            return array_to_pixels(np.asarray(image), name=name, value_range=options.value_range)
+        rgb = np.asarray(image.convert("RGB"))
+        alpha = "A" in image.getbands()
+        return on_grey(rgb, np.asarray(image.getchannel("A")), 255, name) if alpha else rgb

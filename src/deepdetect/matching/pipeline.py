@@ -29,7 +29,7 @@ from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import Images, ignore_masks, load_image, luma
+from ..io.image import Images, at_pixels, load_pair, luma
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 
@@ -105,8 +105,7 @@ def match_images(
         source = checked_positions(source)
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
-    masks = ignore_masks(ignore, 2)
-    rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
+    rgb, masks = load_pair((image0, image1), channels, ignore)
     grays = luma(rgb[0]), luma(rgb[1])
     timer = StageTimer(progress)
     find = [
@@ -116,12 +115,13 @@ def match_images(
     # The initial geometry does not use a network's keypoints, so they are detected after it.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     settings = guiding, model, seed, options, keypoints_last, timer
-    matches = _match_guided(grays, (find[0], find[1]), source, *settings)
+    matches = _unmasked(_match_guided(grays, (find[0], find[1]), source, *settings), masks)
     if not (mutual and matches.success):
         return matches
     if source is not None:
         source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
     back = _match_guided(grays[::-1], (find[1], find[0]), source, *settings)
+    back = _unmasked(back, masks[::-1])
     return _found_both_ways(matches, back)
 
 
@@ -267,6 +267,12 @@ def _match_guided(
         matched.indices0,
         matched.indices1,  # type: ignore[arg-type]  # None: looked up later
     )
+
+
+def _unmasked(matches: Matches, masks: Sequence[np.ndarray | None]) -> Matches:
+    """Drop matches that end in a mask: the second image may show them where it has no keypoint."""
+    dropped = at_pixels(masks[0], matches.points0) | at_pixels(masks[1], matches.points1)
+    return matches[~dropped] if dropped.any() else matches
 
 
 def _found_both_ways(matches: Matches, back: Matches) -> Matches:

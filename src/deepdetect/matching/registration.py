@@ -8,20 +8,22 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from .._shared.alpha import opaque_part
 from .._shared.errors import OptionError, RegistrationError, check_name
-from .._shared.image_array import Channels, to_8_bits
+from .._shared.image_array import Channels, from_16_bits, to_8_bits
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
+from .._shared.value_range import ValueRange
 from ..detector.detector import AnyDetector
 from ..features.selection import SelectionOptions
-from ..geometry.images import downscale, median_local_zncc, warp_bands, warp_to_reference
+from ..geometry.images import downscale, median_local_zncc, warp_bands, warp_visible
 from ..geometry.transforms import (
     outer_corners,
     scaled_homography,
     transform_points,
     translation_matrix,
 )
-from ..io.image import Images, load_deep, load_image, luma
+from ..io.image import Images, load_pixels, luma, one_range
 from ..io.image_file import file_name, is_file
 from ..io.picture_file import read_metadata
 from .pipeline import match_images
@@ -55,13 +57,15 @@ class Registration:
         homography: (3, 3) from the first image to the second.
         first: (H, W, 3) uint8 RGB, the first image in the frame, black outside its own area.
         warped: (H, W, 3) RGB, the second image warped into the frame, black where it has no
-            content. It is uint16 if the second image has more than 8 bits, otherwise uint8.
+            content. It is uint16 if the second image has more than 8 bits, otherwise uint8. A
+            uint16 image keeps its numbers.
         valid: (H, W) bool, where the warped image has content.
         matches: number of dense matches that were kept.
         zncc: median local ZNCC of both images over their overlap, in [-1, 1].
         origin: (x, y) of the frame's first pixel in the first image; (0, 0) except for "union".
         applied: the images of `apply_to` warped into the frame, (H, W, C) with all their bands and
             in their own type. Where they have no content, they are 0, or their no-data value.
+        value_range: the values of black and white in `warped`, if it is uint16.
     """
 
     homography: np.ndarray
@@ -72,6 +76,7 @@ class Registration:
     zncc: float
     origin: tuple[int, int] = (0, 0)
     applied: tuple[np.ndarray, ...] = ()
+    value_range: ValueRange = (0, 65535)
 
     def __repr__(self) -> str:
         height, width = self.valid.shape
@@ -90,11 +95,12 @@ class Registration:
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
         second = self.valid & ((row + column) % 2 == 1)
-        return np.where(second[..., None], to_8_bits(self.warped), self.first)
+        return np.where(second[..., None], to_8_bits(self.warped, self.value_range), self.first)
 
     def difference(self) -> np.ndarray:
         """Return the absolute difference of both images, (H, W, 3) uint8; 0 outside the overlap."""
-        return np.where(self.valid[..., None], cv2.absdiff(self.first, to_8_bits(self.warped)), 0)
+        second = to_8_bits(self.warped, self.value_range)
+        return np.where(self.valid[..., None], cv2.absdiff(self.first, second), 0)
 
 
 @suggest_keywords
@@ -145,7 +151,8 @@ def register(
     check_name("extent", extent, get_args(Extent))
     if isinstance(apply_to, str | bytes) or not isinstance(apply_to, Sequence):
         raise OptionError('`apply_to` must be a list of images, such as ["thermal.tif"]')
-    first, deep = load_image(image0, channels=channels), load_deep(image1, channels)
+    with one_range((image1, image0), channels) as reading:
+        first, deep = load_pixels(image0, channels), load_pixels(image1, channels, deep=True)
     second = to_8_bits(deep)
     matches = match_images(
         first,
@@ -177,17 +184,24 @@ def register(
         margins = (-top, bottom - first.shape[0], -left, right - first.shape[1])
         first = cv2.copyMakeBorder(first, *margins, cv2.BORDER_CONSTANT)
     moved, size = homography @ translation_matrix(left, top), (right - left, bottom - top)
-    warped, valid = warp_to_reference(deep, moved, size)
+    warped, valid = warp_visible(deep, moved, size)
+    (first, empty), hidden = opaque_part(first), opaque_part(deep)[1]
+    if empty is not None:  # there the first image shows what is behind it
+        first = np.where((empty & valid)[..., None], to_8_bits(warped), first)
+    values = reading.deep_range or (0, 65535)
+    warped = from_16_bits(warped, values) if warped.dtype == np.uint16 else warped
+    warped = np.where(valid[..., None], warped, 0)
     applied = []
     for each in apply_to:
-        bands = load_deep(each, channels, raw=True)
+        bands = load_pixels(each, channels, deep=True, raw=True)
         if bands.shape[:2] != deep.shape[:2]:
             raise OptionError(
                 f"{file_name(each)} must have the size of the second image: leave it out"
             )
         no_data = read_metadata(each).no_data if is_file(each) else None
-        applied.append(warp_bands(bands, moved, size, no_data))
-    numbers = len(matches), zncc, (left, top), tuple(applied)
+        seen = hidden if each is image1 else None
+        applied.append(warp_bands(bands, moved, size, no_data, seen))
+    numbers = len(matches), zncc, (left, top), tuple(applied), values
     return Registration(homography, first, warped, valid, *numbers)
 
 

@@ -27,7 +27,7 @@ from ..geometry.estimation import GeometryOptions, check_model
 from ..geometry.images import window_sums
 from ..geometry.relative_pose import RelativePose
 from ..io.exif import calibration_from_exif
-from ..io.image import Images, ignore_masks, load_image, luma
+from ..io.image import Images, load_pair, luma
 from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .outliers import PointFilterOptions
@@ -111,7 +111,8 @@ def reconstruct(
         (True, 'baseline')
     """
     check_model("fundamental", seed, GeometryOptions())
-    rgb, grays, known = _load_pair((image0, image1), channels, calibration, focal_px)
+    images = image0, image1
+    rgb, masks, grays, known = _load_pair(images, channels, calibration, focal_px, ignore)
     timer = StageTimer(progress)
     tentative = rectification = None
     if rectified is None:
@@ -125,7 +126,6 @@ def reconstruct(
                 + (f"; or the disparity offset of {offset:g} px is wrong" if offset else "")
             )
     detector = DeepDetect("dense") if detector is None else detector
-    masks = ignore_masks(ignore, 2)
     # Matches and disparities are computed at whole pixels of the left image.
     whole = None if selection is None else replace(selection, subpixel=False)
     if rectified:
@@ -137,7 +137,8 @@ def reconstruct(
     else:
         with timer.stage("keypoints and matching"):
             matches = match_images(
-                *rgb,
+                rgb[0],
+                rgb[1],
                 detector,
                 selection=whole,
                 ignore=masks,
@@ -206,12 +207,15 @@ def estimate_pose(
         (True, True)
     """
     check_model("fundamental", seed, GeometryOptions())
-    rgb, grays, known = _load_pair((image0, image1), channels, calibration, focal_px)
+    images = image0, image1
+    rgb, masks, grays, known = _load_pair(images, channels, calibration, focal_px)
     timer = StageTimer(progress)
     with timer.stage("keypoints and matching"):
         matches = match_images(
-            *rgb,
+            rgb[0],
+            rgb[1],
             detector,
+            ignore=masks,
             model="fundamental",
             seed=seed,
         )
@@ -318,12 +322,13 @@ def _load_pair(
     channels: Channels,
     calibration: Calibration | str | Path | None,
     focal_px: float | None,
-) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], Calibration]:
-    """Load two images; return them as RGB and as luma, and their calibration."""
-    rgb = load_image(images[0], channels=channels), load_image(images[1], channels=channels)
+    ignore: Any = None,
+) -> tuple[Any, Any, tuple[np.ndarray, np.ndarray], Calibration]:
+    """Load two images; return them as RGB, their masks, both as luma, and their calibration."""
+    rgb, masks = load_pair(images, channels, ignore)
     grays = luma(rgb[0]), luma(rgb[1])
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
-    return rgb, grays, _calibration(calibration, focal_px, images, sizes)
+    return rgb, masks, grays, _calibration(calibration, focal_px, images, sizes)
 
 
 def _calibration(

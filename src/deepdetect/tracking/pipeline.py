@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .._shared.alpha import opaque_part
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
@@ -84,7 +85,7 @@ def track_frames(
     """
     if max_side is not None and not max_side >= MIN_SIDE_PX:
         raise OptionError(f"`max_side` must be at least {MIN_SIDE_PX} pixels, not {max_side}")
-    return ((frame.rgb, _tracked(tracker, frame, max_side)) for frame in source)
+    return ((opaque_part(frame.rgb)[0], _tracked(tracker, frame, max_side)) for frame in source)
 
 
 def _tracked(tracker: Tracker, frame: Frame, max_side: int | None) -> TrackedFrame:

@@ -22,7 +22,7 @@ from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.keypoints import Keypoints
 from ..geometry.images import gaussian_blur, track_round_trip
-from ..io.image import load_image, luma
+from ..io.image import at_pixels, load_visible, luma
 from .alignment import BLUR_SIGMA_PX, Patches, cut_patches, find_patches
 from .tracks import TrackedFrame
 
@@ -121,7 +121,7 @@ class Tracker:
             ImageError: the image cannot be read or used.
             OptionError: the image differs in size from earlier frames.
         """
-        rgb = load_image(image, channels=channels)
+        rgb, hidden = load_visible(image, channels)
         options, gray = self.options, luma(rgb)
         if self._gray is not None:
             if self._gray.shape != gray.shape:
@@ -130,7 +130,7 @@ class Tracker:
                     f"a frame has {width}x{height} pixels, but earlier ones have "
                     f"{before_width}x{before_height}: use one tracker for each size"
                 )
-            self._follow(self._gray, gray)
+            self._follow(self._gray, gray, hidden)
         image = gaussian_blur(gray, BLUR_SIGMA_PX)
         self._return_to_patches(image)
         count = len(self._points["xy"])
@@ -139,7 +139,8 @@ class Tracker:
             or self._since_detection >= options.detect_every
             or count < options.min_kept * self._most
         ):
-            self._add(self.detect(rgb), image)
+            keypoints = self.detect(rgb)
+            self._add(keypoints[~at_pixels(hidden, keypoints.xy)], image)
             self._most = len(self._points["xy"])
             self._since_detection = 0
         self._since_detection += 1
@@ -150,7 +151,7 @@ class Tracker:
         self._frames += 1
         return found
 
-    def _follow(self, before: np.ndarray, gray: np.ndarray) -> None:
+    def _follow(self, before: np.ndarray, gray: np.ndarray, hidden: np.ndarray | None) -> None:
         """Move the points to their positions in the next frame; drop those that are lost."""
         xy = self._points["xy"]
         if not len(xy):
@@ -163,6 +164,7 @@ class Tracker:
             (errors <= self.options.max_return_error_px)
             & (there >= low).all(axis=1)
             & (there <= high).all(axis=1)
+            & ~at_pixels(hidden, there)
         )
         self._points["xy"] = there
         self._points = {name: values[kept] for name, values in self._points.items()}

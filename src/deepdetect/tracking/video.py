@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count, islice
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,8 @@ from .._shared.errors import (
 )
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from ..io.image import find_images, load_image
-from ..io.image_file import IMAGE_SUFFIXES
+from ..io.image import find_images, load_image, load_pixels, one_range
+from ..io.image_file import IMAGE_SUFFIXES, read_with
 from ..io.tiff import page_numbers
 
 FOLDER_FPS = 10.0
@@ -46,7 +46,7 @@ class Frame:
 
     Attributes:
         number: number in the source, from 0 on.
-        rgb: (H, W, 3) uint8 pixels.
+        rgb: (H, W, 3) uint8 pixels, or (H, W, 4) if some are transparent.
     """
 
     number: int
@@ -126,9 +126,12 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
     def _from_images(self) -> Iterator[Frame]:
         first: tuple[int, ...] = ()
+        with one_range([path for path, _ in self._images[:: self.every]]) as reading:
+            pass
         for number, (path, page) in list(enumerate(self._images))[:: self.every]:
             try:
-                rgb = load_image(path, page=page)
+                with read_with(replace(reading, page=page)):
+                    rgb = load_pixels(path)
             except ImageError as error:
                 self.failures.append(str(error))
                 continue

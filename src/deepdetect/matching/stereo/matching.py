@@ -17,7 +17,7 @@ from ..._shared.machine import parallel_for
 from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
-from ...io.image import load_image, luma
+from ...io.image import load_pair, luma
 from .sgm import (
     MAX_DIFFERENCE_PX,
     DisparityRange,
@@ -209,8 +209,11 @@ def disparity_map(
         >>> disparities.at(np.array([[40, 20], [60, 30], [2, 30]])).indices.tolist()
         [0, 1]
     """
-    grays = [luma(load_image(image, channels=channels)) for image in (image0, image1)]
-    return compute_disparity(grays[0], grays[1], options)
+    rgb, (hidden, _) = load_pair((image0, image1), channels)
+    found = compute_disparity(luma(rgb[0]), luma(rgb[1]), options)
+    if hidden is not None:
+        found.disparity[hidden], found.matched[hidden] = np.nan, False
+    return found
 
 
 def compute_disparity(

@@ -12,7 +12,7 @@ from ..._shared.errors import OptionError, RegistrationError
 from ..._shared.machine import require_memory
 from ..._shared.opencv import cv2
 from ...geometry.camera import Camera
-from ...geometry.images import antialiased
+from ...geometry.images import antialiased, without_touched
 from ...geometry.transforms import (
     outer_corners,
     scaled_homography,
@@ -147,7 +147,7 @@ def plan_plane(
         )
         whole = np.full(rgb.shape[:2], 255, np.uint8)
         mask = cv2.warpPerspective(whole, homography, size, flags=cv2.INTER_NEAREST)
-        return WarpedImage(drawn, mask, (left, top))
+        return WarpedImage(*without_touched(drawn, mask), (left, top))
 
     return Canvas(boxes, draw), placed
 
@@ -221,7 +221,7 @@ def plan_curved(
             part = slice(max(-left, 0), min(around - left, mask.shape[1]))
             drawn, mask, left = drawn[:, part], mask[:, part], left + part.start
         corner = left - round(origin * canvas_scale), up - round(top * canvas_scale)
-        return WarpedImage(drawn, mask, corner)
+        return WarpedImage(*without_touched(drawn, mask), corner)
 
     return Canvas(boxes, draw, closed)
 

@@ -8,14 +8,16 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from ..._shared.alpha import continued
 from ..._shared.errors import OptionError, check_name
-from ..._shared.image_array import Channels, to_8_bits
+from ..._shared.image_array import Channels, from_16_bits, to_8_bits
 from ..._shared.options import check_ranges, suggest_keywords, whole
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
-from ...io.image import load_deep
+from ...io.image import load_pixels, one_range
+from ...io.image_file import read_with
 from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .canvas import Canvas, least_distorted, plan_curved, plan_plane
@@ -58,7 +60,7 @@ class Panorama:
 
     Attributes:
         image: (H, W, 3) RGB, black outside of all images; uint16 if an image has more than 8 bits,
-            otherwise uint8.
+            otherwise uint8. If all images are uint16, its numbers are theirs.
         valid: (H, W) bool, true where an image is.
         homographies: (3, 3) homographies by image number, in the order in which images were
             connected. For a flat panorama they map to `image`, otherwise to the reference image.
@@ -173,11 +175,15 @@ def stitch(
     timer = StageTimer(progress)
     small: dict[int, tuple[np.ndarray, float]] = {}
     sizes: dict[int, tuple[int, int]] = {}
-    with timer.stage("reading"):
+    with one_range(images, channels) as reading:
+        pass
+    deep = reading.deep_range is not None
+    with timer.stage("reading"), read_with(reading):
         for number, image in enumerate(images):
-            rgb = to_8_bits(load_deep(image, channels))
+            rgb = continued(load_pixels(image, channels, deep=True))
+            deep &= rgb.dtype == np.uint16
             sizes[number] = (rgb.shape[1], rgb.shape[0])
-            small[number] = downscale(rgb, options.registration_side)
+            small[number] = downscale(to_8_bits(rgb), options.registration_side)
         del rgb
     with timer.stage("registration"):
         registration = register_images(
@@ -193,10 +199,14 @@ def stitch(
         registration, scales, sizes, projection, reference, options.scale
     )
     canvas.check_size(options.max_canvas_megapixels)
-    with timer.stage("compositing"):
+    with timer.stage("compositing"), read_with(reading):
         panorama, valid, gains, parallax = composite(
-            lambda number: load_deep(images[number], channels), small, canvas
+            lambda number: continued(load_pixels(images[number], channels, deep=True)),
+            small,
+            canvas,
         )
+        if deep and reading.deep_range:
+            panorama = np.where(valid[..., None], from_16_bits(panorama, reading.deep_range), 0)
         if crop:
             left, top, right, bottom = crop_box(valid, canvas.closed)
             part = (slice(top, bottom), slice(left, right))

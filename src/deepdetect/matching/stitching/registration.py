@@ -87,7 +87,7 @@ def register_images(
     seed: int = 0,
     progress: Callable[[str], object] | None = None,
 ) -> JointRegistration:
-    """Find the homographies of overlapping images, (H, W, 3) uint8 RGB, to a common frame.
+    """Find the homographies of overlapping uint8 images of 3 or 4 channels to a common frame.
 
     SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
     without heat map do both. The largest group of connected images is registered, or the group that

@@ -1,0 +1,94 @@
+"""The values of black and white in uint16 images that do not state them, one range for a call."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import numpy as np
+
+SENSOR_BITS = (8, 10, 12, 14, 16)
+"""Bit depths of sensors. A uint16 image is assumed to have the smallest that holds its values."""
+
+LITTLE_RANGE = 1 / 8
+"""An image that uses less than this fraction of its range causes a warning, because few grey levels
+are left of it. Chosen by hand."""
+
+MAX_OUTLIERS = 1e-3
+"""This share of the pixels may lie outside the range, because sensors have hot and dead pixels: up
+to one in a thousand. Chosen by hand."""
+
+ValueRange = tuple[float, float]
+
+_call: ContextVar[ValueRange | np.ndarray | None] = ContextVar("range of call", default=None)
+
+
+@contextmanager
+def range_of_call(values: ValueRange | np.ndarray | None) -> Iterator[None]:
+    """Read uint16 images in the block with one range, or add up the counts of their values."""
+    token = _call.set(values)
+    try:
+        yield
+    finally:
+        _call.reset(token)
+
+
+def range_of_uint16(array: np.ndarray, name: str) -> ValueRange:
+    """Return the values of black and white of a uint16 image that does not state them."""
+    counts = np.bincount(array.ravel(), minlength=1 << 16)
+    call = _call.get()
+    if call is None:
+        return find_range(counts, name)
+    if isinstance(call, np.ndarray):
+        call += counts
+        return find_range(counts)
+    low, high = map(round, call)
+    outside = (counts[1 : max(1, low)].sum() + counts[high + 1 : -1].sum()) / counts.sum()
+    if outside > MAX_OUTLIERS:
+        what = f"{outside:.1%} of {name} lies outside {low} to {high}, the range of other images"
+        warnings.warn(f"{what}: give the range by `value_range`", UserWarning, stacklevel=2)
+    return call
+
+
+def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
+    """Find the values of black and white from the counts of all 65536 values.
+
+    White is the largest value of a sensor. Few pixels above it, and padding with 65535, are left
+    out if the octave above it is empty: highlights would lie there. Black is 0. But a narrow band
+    of values that lies farther from 0 than it is wide is spread over all grey levels, as far as
+    each value has a level of its own. With a `name`, little use of the range causes a warning.
+    """
+    levels = np.flatnonzero(counts)
+    full = _white_above(levels.max(initial=0))
+    inner = levels[(levels > 0) & (levels < 65535)]  # 0 and 65535 may be padding
+    if not len(inner):
+        return 0, full
+    total = np.cumsum(counts[inner])
+    shares = (MAX_OUTLIERS * total[-1], (1 - MAX_OUTLIERS) * total[-1])
+    low, high = inner[np.searchsorted(total, shares)].tolist()
+    white = _white_above(high)
+    padded = counts[65535] > shares[0]
+    if counts[white + 1 : 2 * white + 2].any() or (padded and white < 256):
+        white, high = full, 65535 if padded else high
+    width = high - low
+    narrow = 0 < width < min(low, LITTLE_RANGE * white)
+    if name is not None and (narrow or high < LITTLE_RANGE * white):
+        tell_if_little((width if narrow else high) / white, name)
+    if not narrow:
+        return 0, white
+    low, high = max(inner[0], low - width), min(inner[inner <= white][-1], high + width)
+    margin = max(0, 255 - (high - low))
+    return float(low - margin // 2), float(high + margin - margin // 2)
+
+
+def tell_if_little(used: float, name: str) -> None:
+    """Warn if an image uses a small fraction of its range, but not if it shows nothing."""
+    if 0 < used < LITTLE_RANGE:
+        what = f"{name} uses {used:.1%} of its range: give the range by `value_range`"
+        warnings.warn(what, UserWarning, stacklevel=2)
+
+
+def _white_above(value: int) -> int:
+    return 2 ** next(bits for bits in SENSOR_BITS if value < 2**bits) - 1
