@@ -29,9 +29,10 @@ from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import Images, ignore_masks, load_image, luma
+from ..io.image import Images, ignore_masks, load_image
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
+from .overlay import scene_of
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
 """The stages that `match_images` reports. Only a `DeepDetect` without masks has the first as a
@@ -112,22 +113,27 @@ def match_images(
     check_selection(detector, selection)
     masks = ignore_masks(ignore, 2)
     rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
-    grays = luma(rgb[0]), luma(rgb[1])
+    # Finding the network's keypoints fails only for masks of the caller.
+    keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
+    grays, masks, left_out = scene_of(rgb, masks, seed)
+    if left_out and source is not None:
+        source = _in_scene(source, masks)
     timer = StageTimer(progress)
     find = [
         cache(partial(find_keypoints, detector, image, selection, mask))
         for image, mask in zip(rgb, masks, strict=True)
     ]
-    # The network's keypoints take no part in the initial geometry, and finding them cannot fail. So
-    # they are found last, because they are not needed if no geometry can be trusted.
-    keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
+    # The network's keypoints take no part in the initial geometry. So they are found last, because
+    # they are not needed if no geometry can be trusted.
     settings = guiding, model, seed, options, keypoints_last, timer
     matches = _match_guided(grays, (find[0], find[1]), source, *settings)
+    matches = _with_left_out(matches, left_out)
     if not (mutual and matches.success):
         return matches
     if source is not None:
         source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
     back = _match_guided(grays[::-1], (find[1], find[0]), source, *settings)
+    back = _with_left_out(back, left_out)
     return _found_both_ways(matches, back)
 
 
@@ -223,6 +229,31 @@ def match_features(
         indices0=matches.indices0,
         indices1=matches.indices1,
     )
+
+
+def _in_scene(source: Any, masks: Sequence[np.ndarray | None]) -> Any:
+    """Return the sparse matches that neither begin nor end where an image is left out."""
+    tentative = isinstance(source, TentativeMatches)
+    kept = np.ones(len(source.points0 if tentative else source[0]), bool)
+    for points, mask in zip(
+        (source.points0, source.points1) if tentative else source, masks, strict=True
+    ):
+        if mask is not None:
+            last = np.array(mask.shape[::-1]) - 1
+            column, row = np.rint(points).clip(0, last).astype(np.int64).T
+            kept &= ~mask[row, column]
+    if not tentative:
+        return source[0][kept], source[1][kept]
+    matched = source.matched[0][kept], source.matched[1][kept]
+    return replace(source, matched=matched, ratios=source.ratios[kept])
+
+
+def _with_left_out(matches: Matches, share: float) -> Matches:
+    """Note in the evidence which share of the images was left out."""
+    if not share or matches.geometry is None:
+        return matches
+    evidence = replace(matches.geometry.evidence, left_out=share)
+    return replace(matches, geometry=replace(matches.geometry, evidence=evidence))
 
 
 def _match_guided(
