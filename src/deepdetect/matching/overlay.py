@@ -7,6 +7,7 @@ geometry, fill more of the image, and move clearly all around these places.
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Sequence
 
@@ -47,7 +48,7 @@ NEIGHBOURS = 8
 """A place is compared with this many of the nearest matches that move with the scene."""
 
 
-MIN_SHARED_FRAME = 0.8
+MIN_SHARED_FRAME = 0.95
 """Frames of two images stand still if their intersection is at least this share of their union."""
 
 
@@ -96,18 +97,23 @@ def tell_still(share: float) -> None:
     )
 
 
-def find_overlay(grays: Pair, seed: int = 0) -> np.ndarray | None:
-    """Return where two (H, W) uint8 images show an overlay, (H, W) bool, or None without one."""
-    if grays[0].shape != grays[1].shape:
+def find_overlay(grays: Sequence[np.ndarray], seed: int = 0) -> np.ndarray | None:
+    """Return where two or more (H, W) uint8 images show one overlay, (H, W) bool, or None.
+
+    It stands still in all images; the scene moves from one to the next, at least once.
+    """
+    if len({gray.shape for gray in grays}) > 1 or len(grays) < 2:
         return None
-    (first, scale), (second, _) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
-    still = still_places(first, second)
-    if np.count_nonzero(still) < MIN_STILL_CELLS * CELL_PX**2 / 4:
+    small = [downscale(gray, COMPARED_SIDE_PX)[0] for gray in grays]
+    pairs = [*itertools.pairwise(small)]
+    still = np.all([still_places(*pair) for pair in (*pairs, (small[0], small[-1]))], axis=0)
+    if np.count_nonzero(still) < MIN_STILL_CELLS * CELL_PX**2 * MIN_CELL_SHARE:
         return None
-    tentative = find_tentative_matches(*grays)
-    points = tentative.points0 * scale, tentative.points1 * scale
-    found = contradicted(still, *points, seed)
-    if found is None:
+    found = np.zeros(still.shape, bool)
+    for pair in pairs:
+        tentative = find_tentative_matches(*pair)
+        found |= contradicted(still, tentative.points0, tentative.points1, seed)
+    if not found.any():
         return None
     size = grays[0].shape[::-1]
     whole = cv2.resize(found.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
@@ -122,23 +128,22 @@ def still_places(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 def contradicted(
     still: np.ndarray, points0: np.ndarray, points1: np.ndarray, seed: int = 0
-) -> np.ndarray | None:
-    """Return the `still` places that the motion of the scene contradicts, widened, or None.
+) -> np.ndarray:
+    """Return the `still` places, (H, W) bool, that the motion of the scene contradicts, widened.
 
     `points0` and `points1` are the (M, 2) positions of sparse matches, some of which are wrong.
     """
+    nowhere = np.zeros(still.shape, bool)
     motion = np.linalg.norm(points1 - points0, axis=1)
     standing, size = motion < MAX_STILL_PX, still.shape[::-1]
     if np.count_nonzero(standing) < MIN_STILL_MATCHES:
-        return None
+        return nowhere
     others = points0[~standing], points1[~standing]
     model = choose_model(*others, (size, size), "auto", seed, semi_calibrated=False)
     if not model.trusted or np.count_nonzero(model.inliers) < NEIGHBOURS:
-        return None
+        return nowhere
     scene, moved = others[0][model.inliers], motion[~standing][model.inliers]
     regions = widened(still, WINDOW_PX // 2).astype(np.uint8)
-    for place in np.rint(points0[standing]).astype(int).tolist():
-        cv2.circle(regions, place, WINDOW_PX // 2, 1, -1)
     _, labels = cv2.connectedComponents(regions)
     shares = cv2.resize(np.float32(regions), (size[0] // CELL_PX, size[1] // CELL_PX), interpolation=cv2.INTER_AREA)
     rows, columns = np.nonzero(shares > MIN_CELL_SHARE)
@@ -152,7 +157,7 @@ def contradicted(
     clear &= (agreed >= MIN_CLEAR_SHARE * counts)[region] 
     filled = len(np.unique(scene // CELL_PX, axis=0))
     if not MIN_STILL_CELLS <= np.count_nonzero(clear) <= filled:
-        return None
+        return nowhere
     cells = np.zeros(shares.shape, bool)
     cells[rows[clear], columns[clear]] = True
     near = cv2.resize(np.uint8(widened(cells, 1)), size, interpolation=cv2.INTER_NEAREST) > 0

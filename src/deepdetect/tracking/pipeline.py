@@ -19,13 +19,19 @@ from .._shared.progress import progress
 from .._shared.signals import ENDING, exit_by_signal, handle_signals
 from ..detector.detector import Detector
 from ..detector.point_detector import PointDetector
+from ..io.image import luma
 from ..io.image_file import is_path
+from ..matching.overlay import find_overlay, tell_still
 from .tracker import CANDIDATES, Detect, Tracker, TrackingOptions
 from .tracks import TrackDrawer, TrackedFrame, write_tracks
 from .video import Frame, FrameSource, check_video_name, write_video
 
 MIN_SIDE_PX = 32
 """`max_side`, the longer side of scaled frames, must be at least this. Chosen by hand."""
+
+COMPARED_FRAMES, MAX_STEP = 8, 15
+"""An overlay is looked for in this number of frames before the tracking. They are at most the
+second number of frames apart, half a second of most videos, so that they show the same places."""
 
 RATE_FRAMES = 10
 """The displayed frame rate is a mean over this number of frames."""
@@ -45,6 +51,7 @@ class TrackingReport:
         files: files that were written.
         expected: number of frames that the source states, or None. A truncated file has fewer.
         failures: a sentence on each frame of a folder that was left out.
+        left_out: share of the frames that was left out, because it stands still (not of a camera).
     """
 
     frames: int
@@ -56,6 +63,7 @@ class TrackingReport:
     files: tuple[Path, ...]
     expected: int | None = None
     failures: tuple[str, ...] = ()
+    left_out: float = 0.0
 
 
 def point_candidates(options: TrackingOptions = TrackingOptions()) -> Detect:
@@ -91,8 +99,7 @@ def _tracked(tracker: Tracker, frame: Frame, max_side: int | None) -> TrackedFra
     height, width = frame.rgb.shape[:2]
     if max_side is None or max(height, width) <= max_side:
         return tracker.update(frame.rgb, number=frame.number)
-    factor = max_side / max(height, width)
-    size = max(1, round(width * factor)), max(1, round(height * factor))
+    size = _scaled_size((height, width), max_side)
     small = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
     found = tracker.update(small, number=frame.number)
     xy = (found.xy + 0.5) * np.divide((width, height), size) - 0.5
@@ -150,7 +157,8 @@ def track(
     with ExitStack() as stack:
         opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
         detect = point_candidates(options) if detector is None else detector.detect
-        tracker = Tracker(detect, options)
+        overlay = None if opened.live else _find_overlay(source, every, max_side)
+        tracker = Tracker(detect, options, overlay)
         stopped = stack.enter_context(_ended_by_signals(opened.live))
         write = stack.enter_context(write_tracks(table))
         draw = None if video is None else stack.enter_context(write_video(video, opened.fps))
@@ -181,7 +189,29 @@ def track(
         tuple(path for path in (video, table) if path is not None),
         opened.count,
         tuple(opened.failures),
+        0.0 if overlay is None else float(overlay.mean()),
     )
+
+
+def _find_overlay(source: str | Path | int, every: int, max_side: int | None) -> np.ndarray | None:
+    """Return where the first frames of a file or folder, scaled, show an overlay, or None."""
+    with FrameSource(source) as whole:
+        step = min(MAX_STEP, max(1, (whole.count or 0) // COMPARED_FRAMES))
+    with FrameSource(source, every=step * every, max_frames=COMPARED_FRAMES) as some:
+        overlay = find_overlay([luma(frame.rgb) for frame in some])
+    if overlay is None:
+        return None
+    tell_still(float(overlay.mean()))
+    if max_side is None or max(overlay.shape) <= max_side:
+        return overlay
+    size = _scaled_size(overlay.shape, max_side)
+    return cv2.resize(np.uint8(overlay), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _scaled_size(shape: tuple[int, ...], max_side: int) -> tuple[int, int]:
+    """Return the (width, height) of a frame whose longer side is scaled to `max_side`."""
+    factor = max_side / max(shape)
+    return max(1, round(shape[1] * factor)), max(1, round(shape[0] * factor))
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:

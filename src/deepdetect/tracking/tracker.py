@@ -81,6 +81,7 @@ class Tracker:
     Args:
         detect: detects keypoints in a (H, W, 3) uint8 RGB image, as `PointDetector().detect` does.
         options: how points are followed.
+        ignore: (H, W) bool mask of the frames, true where no point is followed; None: nowhere.
 
     Example:
         >>> grid = np.stack(np.meshgrid(range(10, 90, 10), range(10, 60, 10)), -1).reshape(-1, 2)
@@ -93,8 +94,13 @@ class Tracker:
         (40, [3.0, 0.0])
     """
 
-    def __init__(self, detect: Detect, options: TrackingOptions = TrackingOptions()) -> None:
-        self.detect, self.options = detect, options
+    def __init__(
+        self,
+        detect: Detect,
+        options: TrackingOptions = TrackingOptions(),
+        ignore: np.ndarray | None = None,
+    ) -> None:
+        self.detect, self.options, self.ignore = detect, options, ignore
         self._gray: np.ndarray | None = None
         self._frames = self._since_detection = self._next_track = 0
         self._most = 0  # number of tracks after the last detection
@@ -139,16 +145,17 @@ class Tracker:
             or self._since_detection >= options.detect_every
             or count < options.min_kept * self._most
         ):
-            self._add(self.detect(rgb), image)
+            found = self.detect(rgb)
+            self._add(found[self._wanted(found.xy)], image)
             self._most = len(self._points["xy"])
             self._since_detection = 0
         self._since_detection += 1
         self._gray = gray
         copies = {name: values.copy() for name, values in self._points.items()}
-        found = TrackedFrame(self._frames if number is None else number, **copies)
+        tracked = TrackedFrame(self._frames if number is None else number, **copies)
         self._points["ages"] += 1
         self._frames += 1
-        return found
+        return tracked
 
     def _follow(self, before: np.ndarray, gray: np.ndarray) -> None:
         """Move the points to their positions in the next frame; drop those that are lost."""
@@ -164,9 +171,18 @@ class Tracker:
             & (there >= low).all(axis=1)
             & (there <= high).all(axis=1)
         )
+        kept &= self._wanted(there)
         self._points["xy"] = there
         self._points = {name: values[kept] for name, values in self._points.items()}
         self._patches = self._patches.select(kept)
+
+    def _wanted(self, xy: np.ndarray) -> np.ndarray:
+        """Return (N,) bool, False for positions in the mask."""
+        if self.ignore is None:
+            return np.ones(len(xy), bool)
+        last = np.array(self.ignore.shape[::-1]) - 1
+        column, row = np.rint(xy).clip(0, last).astype(np.int64).T
+        return ~self.ignore[row, column]
 
     def _return_to_patches(self, image: np.ndarray) -> None:
         """Align the points with their first patches; cut new patches for those that do not fit."""
