@@ -347,9 +347,7 @@ def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def without_frame(rgb: np.ndarray, ignore: np.ndarray | None) -> np.ndarray | None:
     """Return the ignore mask of a (H, W, 3) image with its uniform frame, if it has one."""
     frame = uniform_frame(rgb)
-    if frame is None or ignore is None:
-        return ignore if frame is None else frame
-    return frame | check_ignore(ignore, frame.shape)
+    return ignore if not frame.any() else frame if ignore is None else frame | ignore
 
 
 def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:

@@ -1,8 +1,8 @@
-"""Find what stands still over images whose scene moves: time stamps, logos, the own bonnet.
+"""Find what stands still over images whose scene moves: frames, captions, logos, the own bonnet.
 
-Places that look the same at the same pixels of both images, and have still sparse matches, would
-fit a scene without motion. They are an overlay only if the other sparse matches agree on one
-geometry, fill more of the image, and move clearly all around these places.
+Places that look the same at the same pixels would fit a scene without motion. They are an overlay
+only if the sparse matches that move agree on one geometry, fill more of the image than the still
+ones, and move clearly all around the still places.
 """
 
 from __future__ import annotations
@@ -22,34 +22,27 @@ from ..io.image import luma
 from .guided.tentative_matches import Pair, find_tentative_matches
 
 COMPARED_SIDE_PX = 640
-"""Images are reduced to this longer side before they are compared: text stays legible in it. All
+"""Images are reduced to this longer side before they are compared: captions stay legible in it. All
 lengths below are in pixels of the reduced images."""
 
 MIN_STILL_ZNCC = 0.9
-"""Windows of two images show the same if their correlation is above this."""
-
-CELL_PX = 16
-"""Side of the square cells in which still and moving places are counted. It is about the side of
-the windows that are compared."""
-
-MIN_STILL_CELLS, MIN_STILL_MATCHES = 3, 4
-"""Fewer still cells or still matches than these may be chance."""
+"""Windows of two images show the same if their correlation is above this. Chosen by hand."""
 
 MAX_STILL_PX, MIN_MOTION_PX = 0.75, 3.0
 """A sparse match stands still if it moves by less than the first value, about the error of a
-keypoint. The scene moves at a place if most matches around it move by more than the second."""
+keypoint. The scene clearly moves where matches move by more than the second."""
 
-MIN_CELL_SHARE, MIN_CLEAR_SHARE = 0.25, 0.67
-"""A cell is still if this share of its pixels is. A connected still region is an overlay if the
-motion of the scene contradicts the second share of its cells; the far end of a street, which hardly
-moves for a camera that drives along it, is contradicted at its edges only."""
+CELL_PX, MIN_STILL_MATCHES = 16, 4
+"""Still and moving matches are counted by the square cells of this side that hold some. Fewer still
+matches than the second number may be chance."""
 
-NEIGHBOURS = 8
-"""A place is compared with this many of the nearest matches that move with the scene."""
+NEIGHBOURS, MIN_CLEAR_SHARE = 8, 0.67
+"""A still match contradicts the scene if so many of the nearest moving matches all move clearly. A
+still region is an overlay if this share of its matches contradicts the scene. At the end of a
+street, which hardly moves for a camera that drives along it, few do."""
 
-
-MIN_SHARED_FRAME = 0.95
-"""Frames of two images stand still if their intersection is at least this share of their union."""
+MIN_COMMON = 0.95
+"""The frames of two images stand still if they have this share of their union in common."""
 
 
 def scene_of(
@@ -57,112 +50,87 @@ def scene_of(
 ) -> tuple[Pair, list[np.ndarray | None], float]:
     """Leave out the frames of two (H, W, 3) images, and what stands still while the scene moves.
 
-    Returns both images as luma, where what is left out is filled smoothly; the `masks` of where no
-    keypoint is wanted, widened by it; and which share of the images stands still. If it is above 0,
-    a warning says so.
+    Returns both images as luma, in which these places are filled smoothly; the ignore `masks`,
+    enlarged by them; and the share of the image that stands still, of which a warning tells.
     """
-    grays, frames = (luma(images[0]), luma(images[1])), [uniform_frame(each) for each in images]
-    first, second = (
-        gray if frame is None else filled_smoothly(gray, frame)
-        for gray, frame in zip(grays, frames, strict=True)
-    )
-    overlay = find_overlay((first, second), seed)
-    if overlay is not None:
-        first, second = filled_smoothly(first, overlay), filled_smoothly(second, overlay)
-    left = [
-        None if not (each := [m for m in (frame, overlay) if m is not None]) else np.any(each, 0)
-        for frame in frames
-    ]
-    still = 0.0 if overlay is None else float(overlay.mean())
-    if left[0] is not None and left[1] is not None and left[0].shape == left[1].shape:
-        shared = left[0] & left[1]
-        if np.count_nonzero(shared) >= MIN_SHARED_FRAME * np.count_nonzero(left[0] | left[1]):
-            still = float(shared.mean())
-    if still:
-        tell_still(still)
-    wanted = [
-        mask if new is None else new if mask is None else new | check_ignore(mask, new.shape)
+    left = [uniform_frame(image) for image in images]
+    grays = [filled_smoothly(luma(each), mask) for each, mask in zip(images, left, strict=True)]
+    share = 0.0
+    if grays[0].shape == grays[1].shape:
+        overlay = find_overlay(grays, seed)
+        grays, left = (
+            [filled_smoothly(gray, overlay) for gray in grays],
+            [m | overlay for m in left],
+        )
+        both = left[0] & left[1]
+        alike = np.count_nonzero(both) >= MIN_COMMON * np.count_nonzero(left[0] | left[1])
+        share = float((both if alike else overlay).mean())
+    tell_still(share)
+    ignored = [
+        mask if not new.any() else new if mask is None else new | check_ignore(mask, new.shape)
         for mask, new in zip(masks, left, strict=True)
     ]
-    return (first, second), wanted, still
+    return (grays[0], grays[1]), ignored, share
 
 
 def tell_still(share: float) -> None:
-    """Warn that a share of the images is left out, because it stands still."""
-    warnings.warn(
-        f"{share:.1%} of the image stands still while the scene moves (a frame, a caption, a logo, "
-        "a part of the vehicle): it is left out",
-        UserWarning,
-        stacklevel=3,
-    )
+    """Warn that a share of the image, if above 0, is left out because it stands still."""
+    if share:
+        warnings.warn(
+            f"{share:.1%} of the image stands still while the scene moves (a frame, a caption, a "
+            "logo, a part of the vehicle): it is left out",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
-def find_overlay(grays: Sequence[np.ndarray], seed: int = 0) -> np.ndarray | None:
-    """Return where two or more (H, W) uint8 images show one overlay, (H, W) bool, or None.
+def find_overlay(grays: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:
+    """Return where (H, W) uint8 images show one overlay, (H, W) bool; none if their sizes differ.
 
-    It stands still in all images; the scene moves from one to the next, at least once.
+    It stands still in all images, and contradicts the motion from one image to the next.
     """
     if len({gray.shape for gray in grays}) > 1 or len(grays) < 2:
-        return None
+        return np.zeros(grays[0].shape, bool)
     small = [downscale(gray, COMPARED_SIDE_PX)[0] for gray in grays]
     pairs = [*itertools.pairwise(small)]
-    still = np.all([still_places(*pair) for pair in (*pairs, (small[0], small[-1]))], axis=0)
-    if np.count_nonzero(still) < MIN_STILL_CELLS * CELL_PX**2 * MIN_CELL_SHARE:
-        return None
+    still = np.all([_still(*pair) for pair in (*pairs, (small[0], small[-1]))], axis=0)
     found = np.zeros(still.shape, bool)
-    for pair in pairs:
+    for pair in pairs if np.count_nonzero(still) >= CELL_PX**2 else ():
         tentative = find_tentative_matches(*pair)
-        found |= contradicted(still, tentative.points0, tentative.points1, seed)
-    if not found.any():
-        return None
+        found |= _contradicted(still, tentative.points0, tentative.points1, seed)
     size = grays[0].shape[::-1]
-    whole = cv2.resize(found.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    whole = cv2.resize(np.uint8(found), size, interpolation=cv2.INTER_NEAREST)
     return widened(whole, FRAME_MARGIN_PX)
 
 
-def still_places(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return where two reduced images show the same texture at the same pixels, (H, W) bool."""
+def _still(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     blurred = gaussian_blur(first, BLUR_SIGMA_PX), gaussian_blur(second, BLUR_SIGMA_PX)
     return np.asarray(local_zncc(*blurred, np.ones(first.shape, bool)) > MIN_STILL_ZNCC)
 
 
-def contradicted(
-    still: np.ndarray, points0: np.ndarray, points1: np.ndarray, seed: int = 0
+def _contradicted(
+    still: np.ndarray, points0: np.ndarray, points1: np.ndarray, seed: int
 ) -> np.ndarray:
-    """Return the `still` places, (H, W) bool, that the motion of the scene contradicts, widened.
-
-    `points0` and `points1` are the (M, 2) positions of sparse matches, some of which are wrong.
-    """
-    nowhere = np.zeros(still.shape, bool)
-    motion = np.linalg.norm(points1 - points0, axis=1)
-    standing, size = motion < MAX_STILL_PX, still.shape[::-1]
-    if np.count_nonzero(standing) < MIN_STILL_MATCHES:
-        return nowhere
-    others = points0[~standing], points1[~standing]
-    model = choose_model(*others, (size, size), "auto", seed, semi_calibrated=False)
-    if not model.trusted or np.count_nonzero(model.inliers) < NEIGHBOURS:
-        return nowhere
-    scene, moved = others[0][model.inliers], motion[~standing][model.inliers]
-    regions = widened(still, WINDOW_PX // 2).astype(np.uint8)
-    _, labels = cv2.connectedComponents(regions)
-    shares = cv2.resize(np.float32(regions), (size[0] // CELL_PX, size[1] // CELL_PX), interpolation=cv2.INTER_AREA)
-    rows, columns = np.nonzero(shares > MIN_CELL_SHARE)
-    centres = (np.column_stack([columns, rows]) + 0.5) * CELL_PX
-    apart, gaps = (_distances(centres, xy) for xy in (points0[standing], scene))
-    own = np.sort(apart, axis=1)[:, 1] < np.sort(gaps, axis=1)[:, 1]
-    nearest = np.argsort(gaps, axis=1)[:, :NEIGHBOURS]
-    clear = own & (moved[nearest].min(axis=1) > MIN_MOTION_PX)
-    region = labels[tuple(centres.T[::-1].astype(np.int64))]
-    counts, agreed = (np.bincount(region[each], minlength=labels.max() + 1) for each in (own, clear))
-    clear &= (agreed >= MIN_CLEAR_SHARE * counts)[region] 
-    filled = len(np.unique(scene // CELL_PX, axis=0))
-    if not MIN_STILL_CELLS <= np.count_nonzero(clear) <= filled:
-        return nowhere
-    cells = np.zeros(shares.shape, bool)
-    cells[rows[clear], columns[clear]] = True
-    near = cv2.resize(np.uint8(widened(cells, 1)), size, interpolation=cv2.INTER_NEAREST) > 0
-    return (regions > 0) & near
-
-
-def _distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return np.asarray(np.linalg.norm(one[:, None] - other[None], axis=2))
+    """Return the regions of still places that the motion of sparse (M, 2) matches contradicts."""
+    _, labels = cv2.connectedComponents(np.uint8(widened(still, WINDOW_PX // 2)))
+    motion, size = np.linalg.norm(points1 - points0, axis=1), still.shape[::-1]
+    moves = motion >= MAX_STILL_PX
+    standing, scene, ends = points0[~moves], points0[moves], points1[moves]
+    model = choose_model(scene, ends, (size, size), "auto", seed, semi_calibrated=False)
+    scene, motion = scene[model.inliers], motion[moves][model.inliers]
+    if not model.trusted or min(len(standing) - MIN_STILL_MATCHES, len(scene) - NEIGHBOURS) < 0:
+        return np.zeros(still.shape, bool)
+    gaps = np.linalg.norm(standing[:, None] - scene[None], axis=2)
+    nearest = np.argpartition(gaps, NEIGHBOURS - 1, axis=1)[:, :NEIGHBOURS]
+    clear = standing[motion[nearest].min(axis=1) > MIN_MOTION_PX]
+    stands, contradicts, moving = (
+        np.bincount(labels[tuple(np.rint(xy.T[::-1]).astype(int))], minlength=labels.max() + 1)
+        for xy in (standing, clear, scene)
+    )
+    # A region of mostly moving matches is an edge along the motion, which only looks still.
+    overlay = contradicts >= np.maximum(np.maximum(MIN_CLEAR_SHARE * stands, moving), 1)
+    overlay[0] = False
+    # If more of the image stands still than moves, something moves before a still camera.
+    cells, moving_cells = (len(np.unique(xy // CELL_PX, axis=0)) for xy in (standing, scene))
+    enough = contradicts[overlay].sum() >= MIN_STILL_MATCHES
+    return np.asarray(overlay[labels] & enough & (cells <= moving_cells))

@@ -116,8 +116,8 @@ def match_images(
     # Finding the network's keypoints fails only for masks of the caller.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     grays, masks, left_out = scene_of(rgb, masks, seed)
-    if left_out and source is not None:
-        source = _in_scene(source, masks)
+    if left_out and isinstance(source, TentativeMatches):
+        source = None  # they are of the whole images
     timer = StageTimer(progress)
     find = [
         cache(partial(find_keypoints, detector, image, selection, mask))
@@ -126,14 +126,12 @@ def match_images(
     # The network's keypoints take no part in the initial geometry. So they are found last, because
     # they are not needed if no geometry can be trusted.
     settings = guiding, model, seed, options, keypoints_last, timer
-    matches = _match_guided(grays, (find[0], find[1]), source, *settings)
-    matches = _with_left_out(matches, left_out)
+    matches = _noted(_match_guided(grays, (find[0], find[1]), source, *settings), left_out)
     if not (mutual and matches.success):
         return matches
     if source is not None:
         source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
-    back = _match_guided(grays[::-1], (find[1], find[0]), source, *settings)
-    back = _with_left_out(back, left_out)
+    back = _noted(_match_guided(grays[::-1], (find[1], find[0]), source, *settings), left_out)
     return _found_both_ways(matches, back)
 
 
@@ -231,29 +229,11 @@ def match_features(
     )
 
 
-def _in_scene(source: Any, masks: Sequence[np.ndarray | None]) -> Any:
-    """Return the sparse matches that neither begin nor end where an image is left out."""
-    tentative = isinstance(source, TentativeMatches)
-    kept = np.ones(len(source.points0 if tentative else source[0]), bool)
-    for points, mask in zip(
-        (source.points0, source.points1) if tentative else source, masks, strict=True
-    ):
-        if mask is not None:
-            last = np.array(mask.shape[::-1]) - 1
-            column, row = np.rint(points).clip(0, last).astype(np.int64).T
-            kept &= ~mask[row, column]
-    if not tentative:
-        return source[0][kept], source[1][kept]
-    matched = source.matched[0][kept], source.matched[1][kept]
-    return replace(source, matched=matched, ratios=source.ratios[kept])
-
-
-def _with_left_out(matches: Matches, share: float) -> Matches:
-    """Note in the evidence which share of the images was left out."""
-    if not share or matches.geometry is None:
+def _noted(matches: Matches, left_out: float) -> Matches:
+    if not left_out or (geometry := matches.geometry) is None:
         return matches
-    evidence = replace(matches.geometry.evidence, left_out=share)
-    return replace(matches, geometry=replace(matches.geometry, evidence=evidence))
+    evidence = replace(geometry.evidence, left_out=left_out)
+    return replace(matches, geometry=replace(geometry, evidence=evidence))
 
 
 def _match_guided(

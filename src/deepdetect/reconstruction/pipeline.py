@@ -28,6 +28,7 @@ from ..geometry.images import window_sums
 from ..geometry.relative_pose import RelativePose
 from ..io.exif import calibration_from_exif
 from ..io.image import Images, ignore_masks, load_image, luma
+from ..matching.overlay import scene_of
 from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .outliers import PointFilterOptions
@@ -111,7 +112,8 @@ def reconstruct(
         (True, 'baseline')
     """
     check_model("fundamental", seed, GeometryOptions())
-    rgb, grays, known = _load_pair((image0, image1), channels, calibration, focal_px)
+    rgb, _, known = _load_pair((image0, image1), channels, calibration, focal_px)
+    grays, masks, _ = scene_of(rgb, ignore_masks(ignore, 2), seed)
     timer = StageTimer(progress)
     tentative = rectification = None
     if rectified is None:
@@ -125,7 +127,6 @@ def reconstruct(
                 + (f"; or the disparity offset of {offset:g} px is wrong" if offset else "")
             )
     detector = DeepDetect("dense") if detector is None else detector
-    masks = ignore_masks(ignore, 2)
     # Matches and disparities are computed at whole pixels of the left image.
     whole = None if selection is None else replace(selection, subpixel=False)
     if rectified:

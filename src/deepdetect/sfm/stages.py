@@ -50,6 +50,7 @@ from .depth_maps import MATCHED_NEIGHBOURS, depth_map, find_references, limited_
 from .formats import FormatName
 from .fusion import fuse_depth_maps, merge_dense_points
 from .mapping import (
+    MIN_VIEWS,
     RegisteredImage,
     SparseModel,
     adjust,
@@ -75,9 +76,8 @@ LINKS = ".images"
 folder is hidden, so that a search for images in a folder above does not find them twice."""
 
 
-COMPARED_PAIRS = 8
-"""An overlay is looked for in this number of pairs of successive images, evenly spread: enough that
-nothing else stands still in all of them."""
+COMPARED_IMAGES = 16
+"""An overlay is looked for in this number of images, the first by name. Chosen by hand."""
 
 
 @suggest_keywords
@@ -209,20 +209,15 @@ class Stages:
         """Return where the images show one overlay, or None; an earlier run's result stays."""
         file = self.work / "overlay.png"
         if not self.features.exists():
-            chosen = np.linspace(0, max(0, len(paths) - 2), COMPARED_PAIRS).astype(int)
-            grays: dict[tuple[int, ...], list[np.ndarray]] = {}
-            for row in sorted({*chosen, *(chosen + 1)} & {*range(len(paths))}):
+            grays = []
+            for path in paths[:COMPARED_IMAGES]:
                 with contextlib.suppress(ImageError):  # the extraction names it
-                    gray = luma(load_image(paths[row]))
-                    grays.setdefault(gray.shape, []).append(gray)
-            found = find_overlay(max(grays.values(), key=len, default=[]), self.seed)
-            if found is None:
-                return None
-            file.parent.mkdir(parents=True, exist_ok=True)
-            save_mask(found, file)
+                    grays.append(luma(load_image(path)))
+            alike = [gray for gray in grays if gray.shape == grays[0].shape]
+            if len(alike) >= MIN_VIEWS and (found := find_overlay(alike, self.seed)).any():
+                save_mask(found, file)
         overlay = load_mask(file) if file.exists() else None
-        if overlay is not None:
-            tell_still(float(overlay.mean()))
+        tell_still(0.0 if overlay is None else float(overlay.mean()))
         return overlay
 
     def extract(

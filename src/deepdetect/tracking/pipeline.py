@@ -99,7 +99,8 @@ def _tracked(tracker: Tracker, frame: Frame, max_side: int | None) -> TrackedFra
     height, width = frame.rgb.shape[:2]
     if max_side is None or max(height, width) <= max_side:
         return tracker.update(frame.rgb, number=frame.number)
-    size = _scaled_size((height, width), max_side)
+    factor = max_side / max(height, width)
+    size = max(1, round(width * factor)), max(1, round(height * factor))
     small = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
     found = tracker.update(small, number=frame.number)
     xy = (found.xy + 0.5) * np.divide((width, height), size) - 0.5
@@ -157,7 +158,7 @@ def track(
     with ExitStack() as stack:
         opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
         detect = point_candidates(options) if detector is None else detector.detect
-        overlay = None if opened.live else _find_overlay(source, every, max_side)
+        overlay = None if opened.live else _find_overlay(source, every)
         tracker = Tracker(detect, options, overlay)
         stopped = stack.enter_context(_ended_by_signals(opened.live))
         write = stack.enter_context(write_tracks(table))
@@ -193,25 +194,14 @@ def track(
     )
 
 
-def _find_overlay(source: str | Path | int, every: int, max_side: int | None) -> np.ndarray | None:
-    """Return where the first frames of a file or folder, scaled, show an overlay, or None."""
+def _find_overlay(source: str | Path | int, every: int) -> np.ndarray | None:
+    """Return where the first frames of a file or folder show an overlay, or None."""
     with FrameSource(source) as whole:
         step = min(MAX_STEP, max(1, (whole.count or 0) // COMPARED_FRAMES))
     with FrameSource(source, every=step * every, max_frames=COMPARED_FRAMES) as some:
         overlay = find_overlay([luma(frame.rgb) for frame in some])
-    if overlay is None:
-        return None
     tell_still(float(overlay.mean()))
-    if max_side is None or max(overlay.shape) <= max_side:
-        return overlay
-    size = _scaled_size(overlay.shape, max_side)
-    return cv2.resize(np.uint8(overlay), size, interpolation=cv2.INTER_NEAREST) > 0
-
-
-def _scaled_size(shape: tuple[int, ...], max_side: int) -> tuple[int, int]:
-    """Return the (width, height) of a frame whose longer side is scaled to `max_side`."""
-    factor = max_side / max(shape)
-    return max(1, round(shape[1] * factor)), max(1, round(shape[0] * factor))
+    return overlay if overlay.any() else None
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:

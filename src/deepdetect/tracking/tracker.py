@@ -81,7 +81,7 @@ class Tracker:
     Args:
         detect: detects keypoints in a (H, W, 3) uint8 RGB image, as `PointDetector().detect` does.
         options: how points are followed.
-        ignore: (H, W) bool mask of the frames, true where no point is followed; None: nowhere.
+        ignore: (H, W) bool mask of the frames, or of larger copies, true where no point is kept.
 
     Example:
         >>> grid = np.stack(np.meshgrid(range(10, 90, 10), range(10, 60, 10)), -1).reshape(-1, 2)
@@ -145,17 +145,17 @@ class Tracker:
             or self._since_detection >= options.detect_every
             or count < options.min_kept * self._most
         ):
-            found = self.detect(rgb)
-            self._add(found[self._wanted(found.xy)], image)
+            self._add(self.detect(rgb), image)
             self._most = len(self._points["xy"])
             self._since_detection = 0
+        self._drop_ignored(gray.shape)
         self._since_detection += 1
         self._gray = gray
         copies = {name: values.copy() for name, values in self._points.items()}
-        tracked = TrackedFrame(self._frames if number is None else number, **copies)
+        found = TrackedFrame(self._frames if number is None else number, **copies)
         self._points["ages"] += 1
         self._frames += 1
-        return tracked
+        return found
 
     def _follow(self, before: np.ndarray, gray: np.ndarray) -> None:
         """Move the points to their positions in the next frame; drop those that are lost."""
@@ -171,18 +171,18 @@ class Tracker:
             & (there >= low).all(axis=1)
             & (there <= high).all(axis=1)
         )
-        kept &= self._wanted(there)
         self._points["xy"] = there
         self._points = {name: values[kept] for name, values in self._points.items()}
         self._patches = self._patches.select(kept)
 
-    def _wanted(self, xy: np.ndarray) -> np.ndarray:
-        """Return (N,) bool, False for positions in the mask."""
-        if self.ignore is None:
-            return np.ones(len(xy), bool)
-        last = np.array(self.ignore.shape[::-1]) - 1
-        column, row = np.rint(xy).clip(0, last).astype(np.int64).T
-        return ~self.ignore[row, column]
+    def _drop_ignored(self, size: tuple[int, ...]) -> None:
+        """Drop the points that the mask ignores in frames of `size`, (H, W)."""
+        if self.ignore is not None:
+            scale = np.divide(self.ignore.shape, size)[::-1]
+            column, row = ((self._points["xy"] + 0.5) * scale).astype(np.int64).T
+            kept = ~self.ignore[row, column]
+            self._points = {name: values[kept] for name, values in self._points.items()}
+            self._patches = self._patches.select(kept)
 
     def _return_to_patches(self, image: np.ndarray) -> None:
         """Align the points with their first patches; cut new patches for those that do not fit."""
