@@ -15,9 +15,9 @@ MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 0.05, 0.002, 0.25
 it covers the second share of the image, one row of 500. The scene covers the third share; a video
 in portrait format covers 0.32 of one in landscape format, a drawing on plain ground often less."""
 
-MAX_RAGGED_PX = 2.0
-"""The scene, or each part of the frame, differs from its convex hull by at most this mean distance
-in pixels along its outline. A skyline is more ragged."""
+MIN_SMOOTH_SHARE = 0.7
+"""The scene, or each part of the frame, reaches this share of the outline of its convex hull, up to
+`FRAME_MARGIN_PX`; where it does not, the scene has the colour of the frame. Skylines do not."""
 
 FRAME_MARGIN_PX = 8
 """Pixels up to this far from a frame or overlay belong to it, because keypoints there would show
@@ -40,23 +40,29 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     _, labels, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     parts = [k for k in border if k and stats[k, cv2.CC_STAT_AREA] >= MIN_FRAME_SHARE * flat.size]
-    frame = np.isin(labels, parts)
-    if not _is_smooth(~frame):
-        frame = np.isin(labels, [k for k in parts if _is_smooth(labels == k)])
+    scene = cv2.morphologyEx(np.uint8(~np.isin(labels, parts)), cv2.MORPH_OPEN, np.ones((3, 3)))
+    hull, smooth = _convex_hull(scene)
+    frame = ~hull
+    if not (smooth and frame.any()):
+        frame = np.isin(labels, [k for k in parts if _convex_hull(np.uint8(labels == k))[1]])
     sides = [frame[0].any(), frame[-1].any(), frame[:, 0].any(), frame[:, -1].any()]
-    # The sky may be as uniform, but it does not reach all four sides, and is not black.
-    if not (all(sides) or not colour.any()) or frame.mean() > 1 - MIN_SCENE_SHARE:
+    # A sky may be as uniform, but it does not reach all four sides, and is not black.
+    if sum(sides) < (4 if colour.any() else 3) or frame.mean() > 1 - MIN_SCENE_SHARE:
         return nowhere
     return widened(frame, FRAME_MARGIN_PX)
 
 
-def _is_smooth(region: np.ndarray) -> bool:
-    points = cv2.findNonZero(region.astype(np.uint8))
-    if points is None:
-        return False
-    hull = cv2.convexHull(points)
-    lacking = np.count_nonzero(cv2.fillConvexPoly(np.zeros(region.shape), hull, 1)) - len(points)
-    return bool(lacking <= MAX_RAGGED_PX * cv2.arcLength(hull, True))
+def _convex_hull(region: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the convex hull of a region as (H, W) bool, and whether its outline is smooth."""
+    hull, outline = np.zeros_like(region), np.zeros_like(region)
+    if (points := cv2.findNonZero(region)) is None:
+        return hull > 0, False
+    corners = cv2.convexHull(points)
+    cv2.fillConvexPoly(hull, corners, 1)
+    cv2.polylines(outline, [corners], True, 1)
+    inner = outline[1:-1, 1:-1] > 0
+    reached = widened(region, FRAME_MARGIN_PX)[1:-1, 1:-1][inner]
+    return hull > 0, bool(len(reached) and reached.mean() >= MIN_SMOOTH_SHARE)
 
 
 def widened(mask: np.ndarray, radius_px: int) -> np.ndarray:
@@ -72,7 +78,7 @@ def filled_smoothly(gray: np.ndarray, mask: np.ndarray) -> np.ndarray:
     levels = [(gray * np.float32(~mask), np.float32(~mask))]
     while min(levels[-1][1].shape) > 1:
         levels.append((cv2.pyrDown(levels[-1][0]), cv2.pyrDown(levels[-1][1])))
-    values = np.zeros((1, 1), np.float32)
+    values = np.full((1, 1), gray[~mask].mean() if not mask.all() else 0, np.float32)
     for total, weight in reversed(levels):
         coarse = cv2.resize(values, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
         values = total + coarse * (1 - weight)
