@@ -40,11 +40,15 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     _, labels, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     parts = [k for k in border if k and stats[k, cv2.CC_STAT_AREA] >= MIN_FRAME_SHARE * flat.size]
-    scene = cv2.morphologyEx(np.uint8(~np.isin(labels, parts)), cv2.MORPH_OPEN, np.ones((3, 3)))
+    scene = cv2.morphologyEx(
+        (~np.isin(labels, parts)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))
+    )
     hull, smooth = _convex_hull(scene)
     frame = ~hull
     if not (smooth and frame.any()):
-        frame = np.isin(labels, [k for k in parts if _convex_hull(np.uint8(labels == k))[1]])
+        frame = np.isin(
+            labels, [k for k in parts if _convex_hull((labels == k).astype(np.uint8))[1]]
+        )
     sides = [frame[0].any(), frame[-1].any(), frame[:, 0].any(), frame[:, -1].any()]
     # A sky may be as uniform, but it does not reach all four sides, and is not black.
     if sum(sides) < (4 if colour.any() else 3) or frame.mean() > 1 - MIN_SCENE_SHARE:

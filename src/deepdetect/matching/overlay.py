@@ -43,9 +43,9 @@ CELL_PX = 16
 """Still corners and moving matches are counted by the square cells of this side that hold some."""
 
 NEIGHBOURS, MIN_CLEAR_SHARE = 8, 0.67
-"""A still corner contradicts the scene if so many of the nearest moving matches all move clearly. A
-still region is an overlay if this share of its corners contradicts the scene. At the end of a
-street, which hardly moves for a camera that drives along it, few do."""
+"""A still corner contradicts the scene if this number of its nearest moving matches all move
+clearly. A still region is an overlay if this share of its corners contradicts the scene. At
+the end of a street, which hardly moves for a camera that drives along it, few do."""
 
 MIN_COMMON = 0.95
 """The frames of two images stand still if they have this share of their union in common."""
