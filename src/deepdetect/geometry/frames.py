@@ -6,18 +6,14 @@ import numpy as np
 
 from .._shared.opencv import cv2
 
-MAX_FRAME_NOISE = 12
-"""Pixels of a frame differ from its colour by at most this number of grey levels in each channel,
-which is about what JPEG leaves."""
-
-MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 0.05, 0.002, 0.25
-"""A frame has at least the first share of the outermost pixels in exactly its colour. Each part of
-it covers the second share of the image, one row of 500. The scene covers the third share; a video
-in portrait format covers 0.32 of one in landscape format, a drawing on plain ground often less."""
-
+MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
 MIN_SMOOTH_SHARE = 0.7
-"""The scene, or each part of the frame, reaches this share of the outline of its convex hull, up to
-`FRAME_MARGIN_PX`; where it does not, the scene has the colour of the frame. Skylines do not."""
+"""Pixels of a frame differ from its colour by at most this number of grey levels in each channel,
+about what JPEG leaves; the first share of the outermost pixels has exactly this colour. Each part
+covers the second share of the image, one row of 500. The scene covers the third share; a video in
+portrait format covers 0.32 of one in landscape format. The scene, or each part of the frame,
+reaches `MIN_SMOOTH_SHARE` of the outline of its convex hull, up to `FRAME_MARGIN_PX`: a scene may
+partly have the colour of the frame, but a skyline does not reach so much."""
 
 FRAME_MARGIN_PX = 8
 """Pixels up to this far from a frame or overlay belong to it, because keypoints there would show
