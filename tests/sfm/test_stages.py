@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from deepdetect import ImageError, OptionError, PointDetector, reconstruct_many
 from deepdetect.batch.hdf5 import SETTINGS, open_hdf5
@@ -91,3 +92,21 @@ def test_results_among_the_images_are_no_images(nested: Path) -> None:
 def test_images_keep_their_names_where_results_are_among_them(nested: Path) -> None:
     made = Stages(nested / "model", MultiViewOptions(), 1, True).folder_of(nested)
     assert {*check_images(made)} == {"3.png", "a/1.png", "b/2.png"}
+
+
+def test_a_caption_over_all_images_holds_no_keypoint(tmp_path: Path, pycolmap) -> None:
+    photograph = pytest.importorskip("skimage.data").astronaut()
+    for k in range(4):
+        image = photograph[10 * k : 10 * k + 240, 30 * k : 30 * k + 320].copy()
+        image[180:230, 20:200] = photograph[300:350, 200:380]
+        (tmp_path / "images").mkdir(exist_ok=True)
+        Image.fromarray(image).save(tmp_path / "images" / f"{k}.png")
+    stages = Stages(tmp_path / "model", MultiViewOptions(), 1, True)
+    for _ in range(2):  # the second time from its file
+        with pytest.warns(UserWarning, match="still"):
+            stages.extract(tmp_path / "images", PointDetector(500))
+    with open_hdf5(stages.features) as file:
+        for k in range(4):
+            x, y = file[f"{k}.png"]["keypoints"][()].T
+            assert len(x) > 100
+            assert not ((x > 22) & (x < 198) & (y > 182) & (y < 228)).any()

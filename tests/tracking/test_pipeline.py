@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from deepdetect import OptionError
 from deepdetect.tracking import FrameSource, Tracker, TrackingOptions, load_tracks, track
@@ -195,3 +196,19 @@ def test_a_video_is_not_replaced_by_its_tracks(
             track(source, output, options=FEW)
     assert (tmp_path / "v.mp4").read_bytes() == content
     assert sorted(os.listdir(tmp_path)) == ["frames", "link.mp4", "v.mp4"]
+
+
+def test_no_track_follows_a_caption(moving_photo, tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for k in range(8):
+        frame = moving_photo(k, (8, 5))
+        frame[10:60, 20:140] = moving_photo(0)[100:150, 60:180]
+        Image.fromarray(frame).save(folder / f"{k:03d}.png")
+    with pytest.warns(UserWarning, match="still"):
+        report = track(folder, tmp_path / "t.csv", options=FEW)
+    assert 0.05 < report.left_out < 0.3
+    for frame in load_tracks(tmp_path / "t.csv"):
+        x, y = frame.xy.T
+        assert len(frame) > 20
+        assert not ((x > 22) & (x < 138) & (y > 12) & (y < 58)).any()

@@ -17,7 +17,7 @@ import numpy as np
 from .. import __version__
 from .._shared.errors import noted_failures
 from .._shared.options import suggest_keywords
-from .._shared.records import file_state
+from .._shared.records import file_state, key
 from ..detector.detector import DeepDetect, check_selection, find_keypoints
 from ..detector.heatmap import HeatmapOptions, seen_size
 from ..detector.point_detector import PointDetector
@@ -39,6 +39,7 @@ def extract_features(
     detector: DeepDetect | PointDetector | None = None,
     *,
     selection: SelectionOptions | None = None,
+    ignore: np.ndarray | None = None,
     max_megapixels: float | None = None,
     engine: str = "processes",
     workers: int | None = None,
@@ -71,6 +72,7 @@ def extract_features(
             because every process has a detector of its own.
         selection: which pixels of a `DeepDetect` heat map become keypoints; None: those with a
             probability above 0.5.
+        ignore: (H, W) array, true where images of this size get no keypoint.
         max_megapixels: limit for an image, as in `load_image`; larger images count as failures.
         engine: "processes" for processes on this machine, or "ray" for a Ray cluster.
         workers: number of processes; default: one per processor.
@@ -110,6 +112,8 @@ def extract_features(
         else ROOT_SIFT,
         "version": __version__,
     }
+    if ignore is not None:
+        settings["ignore"] = key(ignore)
     report = fill_file(
         path,
         settings,
@@ -118,6 +122,7 @@ def extract_features(
             _extract,
             root=root,
             selection=selection,
+            ignore=ignore,
             detector=detector,
             reading=reading,  # other processes do not inherit these options
         ),
@@ -139,6 +144,7 @@ def _extract(
     root: Path,
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
+    ignore: np.ndarray | None,
     reading: ReadingOptions,
 ) -> Iterator[Group]:
     for name, state in images:
@@ -146,6 +152,8 @@ def _extract(
             with read_with(reading):
                 rgb, hidden = load_visible(root / name)
             gray = luma(rgb)
+            if ignore is not None and ignore.shape == gray.shape:
+                hidden = ignore if hidden is None else hidden | ignore
             keypoints = find_keypoints(detector, rgb, selection, hidden)
             if isinstance(detector, PointDetector):
                 keypoints = detector.describe(rgb, keypoints)

@@ -19,7 +19,7 @@ from .._shared.records import Outputs, plain
 from ..detector.detector import DeepDetect, find_keypoints
 from ..detector.point_detector import PointDetector
 from ..features.pictures import draw_best_keypoints, draw_dense_keypoints
-from ..features.selection import SelectionOptions, select_keypoints
+from ..features.selection import SelectionOptions, select_keypoints, without_frame
 from ..io.image import load_visible, one_range
 from ..io.image_file import reading_options
 from ..io.masks import load_mask
@@ -150,6 +150,7 @@ class _Work:
             # Both maps come from one call, so that the network runs only once.
             heatmap, logits = self.detector.heatmap_and_logits(rgb)
             selection = self.selection or SelectionOptions()
+            mask = without_frame(rgb, mask)
             keypoints = select_keypoints(heatmap, selection, logits, ignore=mask)
         else:
             keypoints = find_keypoints(self.detector, rgb, self.selection, mask)

@@ -19,6 +19,7 @@ from ..features.selection import (
     check_max_keypoints,
     select_from_maps,
     select_keypoints,
+    without_frame,
 )
 from ..features.sift import describe_keypoints
 from ..io.image import (
@@ -335,6 +336,7 @@ class DeepDetect:
             options = replace(options, max_keypoints=self.max_keypoints)
         rgb, ignore = load_visible(rgb, ignore=ignore)
         with memory_named(rgb.shape):
+            ignore = without_frame(rgb, ignore)
             maps = compute_maps(rgb, self._network, self.heatmap_options)
             del rgb  # frees memory for the keypoints
             return select_from_maps(maps, options, ignore)

@@ -16,7 +16,7 @@ from .._shared.options import check_ranges, names_a_file, suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
 from ..features.learned import LEARNED
-from ..features.selection import check_ignore, check_max_keypoints
+from ..features.selection import check_ignore, check_max_keypoints, without_frame
 from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import (
     Images,
@@ -263,6 +263,7 @@ class PointDetector:
         height, width = gray.shape
         if ignore is not None:
             ignore = check_ignore(ignore, gray.shape)
+        ignore = without_frame(rgb, ignore)
         gray = self._scaled(gray)
         size = (gray.shape[1], gray.shape[0])
         scaled = size != (width, height)

@@ -44,6 +44,8 @@ class Evidence:
         correlation: median ZNCC between windows of the first image and their places in the second.
             Each place is predicted by the matches around a window, not by those inside it, so it
             shows the same content if the matches are correct. 0 if there are few matches.
+        left_out: share of the image that was left out, because it stands still while the scene
+            moves: a frame, a caption, a logo, the own vehicle.
     """
 
     tentative_matches: int = 0
@@ -54,6 +56,7 @@ class Evidence:
     off_plane: int = 0
     verified: float = 0.0
     correlation: float = 0.0
+    left_out: float = 0.0
 
 
 @suggest_keywords

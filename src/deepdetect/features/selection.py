@@ -10,6 +10,7 @@ import numpy as np
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.options import numbers_of, suggest_keywords
+from ..geometry.frames import uniform_frame
 from .keypoints import Keypoints, bayer_order
 
 MAX_OFFSET_PX = 0.499
@@ -341,6 +342,12 @@ def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
             f"the ignore mask must have the shape {shape} of the image, not {mask.shape}"
         )
     return mask
+
+
+def without_frame(rgb: np.ndarray, ignore: np.ndarray | None) -> np.ndarray | None:
+    """Return the ignore mask of a (H, W, 3) image with its uniform frame, if it has one."""
+    frame = uniform_frame(rgb)
+    return ignore if not frame.any() else frame if ignore is None else frame | ignore
 
 
 def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:

@@ -29,9 +29,10 @@ from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import Images, at_pixels, load_pair, luma
+from ..io.image import Images, at_pixels, load_pair
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
+from .overlay import scene_of
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
 """The stages that `match_images` reports. "initial geometry" is reported only for a `DeepDetect`
@@ -106,22 +107,26 @@ def match_images(
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
     rgb, masks = load_pair((image0, image1), channels, ignore)
-    grays = luma(rgb[0]), luma(rgb[1])
+    # The initial geometry does not use a network's keypoints, so they are detected after it; with
+    # masks of the caller or transparent pixels, they are detected before.
+    keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
+    grays, masks, left_out = scene_of(rgb, masks, seed)
+    if left_out and isinstance(source, TentativeMatches):
+        source = None  # they are of the whole images
     timer = StageTimer(progress)
     find = [
         cache(partial(find_keypoints, detector, image, selection, mask))
         for image, mask in zip(rgb, masks, strict=True)
     ]
-    # The initial geometry does not use a network's keypoints, so they are detected after it.
-    keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     settings = guiding, model, seed, options, keypoints_last, timer
-    matches = _unmasked(_match_guided(grays, (find[0], find[1]), source, *settings), masks)
+    matches = _match_guided(grays, (find[0], find[1]), source, *settings)
+    matches = _noted(_unmasked(matches, masks), left_out)
     if not (mutual and matches.success):
         return matches
     if source is not None:
         source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
     back = _match_guided(grays[::-1], (find[1], find[0]), source, *settings)
-    back = _unmasked(back, masks[::-1])
+    back = _noted(_unmasked(back, masks[::-1]), left_out)
     return _found_both_ways(matches, back)
 
 
@@ -216,6 +221,13 @@ def match_features(
         indices0=matches.indices0,
         indices1=matches.indices1,
     )
+
+
+def _noted(matches: Matches, left_out: float) -> Matches:
+    if not left_out or (geometry := matches.geometry) is None:
+        return matches
+    evidence = replace(geometry.evidence, left_out=left_out)
+    return replace(matches, geometry=replace(geometry, evidence=evidence))
 
 
 def _match_guided(

@@ -23,9 +23,10 @@ from ..geometry.transforms import (
     transform_points,
     translation_matrix,
 )
-from ..io.image import Images, load_pixels, luma, one_range
+from ..io.image import Images, load_pixels, one_range
 from ..io.image_file import file_name, is_file
 from ..io.picture_file import read_metadata
+from .overlay import scene_of
 from .pipeline import match_images
 
 Extent = Literal["reference", "union"]
@@ -171,7 +172,7 @@ def register(
         raise RegistrationError(
             "no homography can be trusted: both images must show a plane or be taken from one place"
         )
-    grays = luma(first), luma(second)
+    grays = scene_of((first, second), (None, None), seed)[0]
     if not agree(*grays, homography):
         raise RegistrationError(
             "the images contradict the homography of their matches: warped, they are no more alike "

@@ -28,6 +28,7 @@ from ..geometry.images import window_sums
 from ..geometry.relative_pose import RelativePose
 from ..io.exif import calibration_from_exif
 from ..io.image import Images, load_pair, luma
+from ..matching.overlay import scene_of
 from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .outliers import PointFilterOptions
@@ -112,7 +113,8 @@ def reconstruct(
     """
     check_model("fundamental", seed, GeometryOptions())
     images = image0, image1
-    rgb, masks, grays, known = _load_pair(images, channels, calibration, focal_px, ignore)
+    rgb, masks, _, known = _load_pair(images, channels, calibration, focal_px, ignore)
+    grays, masks, _ = scene_of(rgb, masks, seed)
     timer = StageTimer(progress)
     tentative = rectification = None
     if rectified is None:

@@ -113,7 +113,8 @@ class SparseModel:
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
     """Verify matched pairs by their two-view geometry, which is stored in the database.
 
-    Returns the number of inliers of each pair that has at least `MIN_VERIFIED`.
+    Returns the number of inliers of each pair that has at least `MIN_VERIFIED`, without pairs that
+    agree only on what stands still at the border of both images, a watermark.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_VERIFIED)
@@ -124,8 +125,11 @@ def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> d
         pycolmap.geometric_verification(database, verifier, pairing, how)
         with pycolmap.Database.open(database) as opened:
             names = {image.image_id: image.name for image in opened.read_all_images()}
-            numbers = zip(*opened.read_two_view_geometry_num_inliers(), strict=True)
-            pairs = [(pycolmap.pair_id_to_image_pair(pair), count) for pair, count in numbers]
+            pairs = [
+                (pycolmap.pair_id_to_image_pair(pair), len(found.inlier_matches))
+                for pair, found in zip(*opened.read_two_view_geometries(), strict=True)
+                if found.config != pycolmap.TwoViewGeometryConfiguration.WATERMARK
+            ]
     return {(names[a], names[b]): count for (a, b), count in pairs if count >= MIN_VERIFIED}
 
 
@@ -149,7 +153,7 @@ def map_images(
         how.max_num_models = MAX_MODELS
         how.init_num_trials = MAX_FIRST_PAIRS
         how.min_num_matches = MIN_VERIFIED
-        how.extract_colors = False
+        how.extract_colors, how.ignore_watermarks = False, True
         how.random_seed = seed
         if known_cameras:
             how.ba_refine_focal_length = False
@@ -188,6 +192,7 @@ def map_globally(
     with quiet_pycolmap() as pycolmap, tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
         how = pycolmap.GlobalPipelineOptions()
         how.min_model_size, how.min_num_matches, how.random_seed = MIN_VIEWS, MIN_VERIFIED, seed
+        how.ignore_watermarks = True
         if known_cameras:
             how.mapper.bundle_adjustment.refine_focal_length = False
             how.mapper.bundle_adjustment.refine_extra_params = False

@@ -19,7 +19,13 @@ import numpy as np
 
 from .. import __version__
 from .._shared.atomic import atomic_path
-from .._shared.errors import MissingImageError, OptionError, ReconstructionError, check_name
+from .._shared.errors import (
+    ImageError,
+    MissingImageError,
+    OptionError,
+    ReconstructionError,
+    check_name,
+)
 from .._shared.machine import available_memory, map_in_processes, needed_memory, processor_count
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import progress
@@ -35,13 +41,16 @@ from ..features.keypoints import Keypoints
 from ..features.match_filter import suits_filter
 from ..features.selection import SelectionOptions
 from ..geometry.camera import PosedView
-from ..io.image import find_images, load_image, name_images, one_range
+from ..io.image import find_images, load_image, luma, name_images, one_range
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with
+from ..io.masks import load_mask, save_mask
+from ..matching.overlay import find_overlay, tell_still
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .depth_maps import MATCHED_NEIGHBOURS, depth_map, find_references, limited_view
 from .formats import FormatName
 from .fusion import fuse_depth_maps, merge_dense_points
 from .mapping import (
+    MIN_VIEWS,
     RegisteredImage,
     SparseModel,
     adjust,
@@ -65,6 +74,10 @@ WORK = "work"
 LINKS = ".images"
 """Name of a folder inside `WORK` with links to the images, if the user gave a list of files. The
 folder is hidden, so that a search for images in a folder above does not find them twice."""
+
+
+COMPARED_IMAGES = 16
+"""An overlay is looked for in this number of images, the first by name. Chosen by hand."""
 
 
 @suggest_keywords
@@ -193,6 +206,21 @@ class Stages:
                 shutil.copy2(path, folder / name)
         return folder
 
+    def find_overlay(self, paths: Sequence[Path]) -> np.ndarray | None:
+        """Return where the images show one overlay, or None; an earlier run's result stays."""
+        file = self.work / "overlay.png"
+        if not self.features.exists():
+            grays = []
+            for path in paths[:COMPARED_IMAGES]:
+                with contextlib.suppress(ImageError):  # the extraction names it
+                    grays.append(luma(load_image(path)))
+            alike = [gray for gray in grays if gray.shape == grays[0].shape]
+            if len(alike) >= MIN_VIEWS and (found := find_overlay(alike, self.seed)).any():
+                save_mask(found, file)
+        overlay = load_mask(file) if file.exists() else None
+        tell_still(0.0 if overlay is None else float(overlay.mean()))
+        return overlay
+
     def extract(
         self,
         folder: Path,
@@ -204,11 +232,13 @@ class Stages:
         Returns three mappings by image name: the sizes (width, height) and the numbers of keypoints
         of the images that could be read, and, for each other image, a sentence that says why not.
         """
+        overlay = self.find_overlay([folder / name for name in check_images(folder)])
         report = extract_features(
             folder,
             self.features,
             detector,
             selection=selection,
+            ignore=overlay,
             workers=self.workers,
             quiet=self.quiet,
         )

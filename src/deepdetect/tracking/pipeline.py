@@ -20,13 +20,19 @@ from .._shared.progress import progress
 from .._shared.signals import ENDING, exit_by_signal, handle_signals
 from ..detector.detector import Detector
 from ..detector.point_detector import PointDetector
+from ..io.image import luma
 from ..io.image_file import is_path
+from ..matching.overlay import find_overlay, tell_still
 from .tracker import CANDIDATES, Detect, Tracker, TrackingOptions
 from .tracks import TrackDrawer, TrackedFrame, write_tracks
 from .video import Frame, FrameSource, check_video_name, write_video
 
 MIN_SIDE_PX = 32
 """`max_side`, the longer side of scaled frames, must be at least this. Chosen by hand."""
+
+COMPARED_FRAMES, MAX_STEP = 8, 15
+"""An overlay is looked for in this number of frames before the tracking. They are at most the
+second number of frames apart, half a second of most videos, so that they show the same places."""
 
 RATE_FRAMES = 10
 """The displayed frame rate is a mean over this number of frames."""
@@ -46,6 +52,7 @@ class TrackingReport:
         files: files that were written.
         expected: number of frames that the source states, or None. A truncated file has fewer.
         failures: a sentence on each frame of a folder that was left out.
+        left_out: share of the frames that was left out, because it stands still (not of a camera).
     """
 
     frames: int
@@ -57,6 +64,7 @@ class TrackingReport:
     files: tuple[Path, ...]
     expected: int | None = None
     failures: tuple[str, ...] = ()
+    left_out: float = 0.0
 
 
 def point_candidates(options: TrackingOptions = TrackingOptions()) -> Detect:
@@ -151,7 +159,8 @@ def track(
     with ExitStack() as stack:
         opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
         detect = point_candidates(options) if detector is None else detector.detect
-        tracker = Tracker(detect, options)
+        overlay = None if opened.live else _find_overlay(source, every)
+        tracker = Tracker(detect, options, overlay)
         stopped = stack.enter_context(_ended_by_signals(opened.live))
         write = stack.enter_context(write_tracks(table))
         draw = None if video is None else stack.enter_context(write_video(video, opened.fps))
@@ -182,7 +191,18 @@ def track(
         tuple(path for path in (video, table) if path is not None),
         opened.count,
         tuple(opened.failures),
+        0.0 if overlay is None else float(overlay.mean()),
     )
+
+
+def _find_overlay(source: str | Path | int, every: int) -> np.ndarray | None:
+    """Return where the first frames of a file or folder show an overlay, or None."""
+    with FrameSource(source) as whole:
+        step = min(MAX_STEP, max(1, (whole.count or 0) // COMPARED_FRAMES))
+    with FrameSource(source, every=step * every, max_frames=COMPARED_FRAMES) as some:
+        overlay = find_overlay([luma(frame.rgb) for frame in some])
+    tell_still(float(overlay.mean()))
+    return overlay if overlay.any() else None
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:

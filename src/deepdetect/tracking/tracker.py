@@ -81,6 +81,7 @@ class Tracker:
     Args:
         detect: detects keypoints in a (H, W, 3) uint8 RGB image, as `PointDetector().detect` does.
         options: how points are followed.
+        ignore: (H, W) bool mask of the frames, or of larger copies, true where no point is kept.
 
     Example:
         >>> grid = np.stack(np.meshgrid(range(10, 90, 10), range(10, 60, 10)), -1).reshape(-1, 2)
@@ -93,8 +94,13 @@ class Tracker:
         (40, [3.0, 0.0])
     """
 
-    def __init__(self, detect: Detect, options: TrackingOptions = TrackingOptions()) -> None:
-        self.detect, self.options = detect, options
+    def __init__(
+        self,
+        detect: Detect,
+        options: TrackingOptions = TrackingOptions(),
+        ignore: np.ndarray | None = None,
+    ) -> None:
+        self.detect, self.options, self.ignore = detect, options, ignore
         self._gray: np.ndarray | None = None
         self._frames = self._since_detection = self._next_track = 0
         self._most = 0  # number of tracks after the last detection
@@ -143,6 +149,7 @@ class Tracker:
             self._add(keypoints[~at_pixels(hidden, keypoints.xy)], image)
             self._most = len(self._points["xy"])
             self._since_detection = 0
+        self._drop_ignored(gray.shape)
         self._since_detection += 1
         self._gray = gray
         copies = {name: values.copy() for name, values in self._points.items()}
@@ -169,6 +176,15 @@ class Tracker:
         self._points["xy"] = there
         self._points = {name: values[kept] for name, values in self._points.items()}
         self._patches = self._patches.select(kept)
+
+    def _drop_ignored(self, size: tuple[int, ...]) -> None:
+        """Drop the points that the mask ignores in frames of `size`, (H, W)."""
+        if self.ignore is not None:
+            scale = np.divide(self.ignore.shape, size)[::-1]
+            column, row = ((self._points["xy"] + 0.5) * scale).astype(np.int64).T
+            kept = ~self.ignore[row, column]
+            self._points = {name: values[kept] for name, values in self._points.items()}
+            self._patches = self._patches.select(kept)
 
     def _return_to_patches(self, image: np.ndarray) -> None:
         """Align the points with their first patches; cut new patches for those that do not fit."""

@@ -7,9 +7,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import skimage.data
 from PIL import Image
 
-from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError, PointDetector
+from deepdetect import (
+    DeepDetect,
+    DeepDetectError,
+    ImageError,
+    OptionError,
+    PointDetector,
+    RegistrationError,
+)
 from deepdetect.geometry import transform_points
 from deepdetect.matching.stitching import Panorama, StitchingOptions, stages_of, stitch
 from deepdetect_lab.evaluation.metrics.homography import corner_error
@@ -326,3 +334,12 @@ def test_parallax_along_a_seam_is_told(surroundings: np.ndarray) -> None:
     found = stitch(images, PointDetector(1000), projection="cylindrical")
     assert set(found.parallax) == {(0, 1), (1, 2)}
     assert all(distance == pytest.approx(6, abs=1.5) for distance in found.parallax.values())
+
+
+def test_screens_with_a_fixed_header_are_refused() -> None:
+    page = np.ascontiguousarray(skimage.data.astronaut()[:, :300])
+    screens = [page[top : top + 300].copy() for top in (0, 80, 160)]
+    for screen in screens:
+        screen[:60] = skimage.data.coffee()[100:160, 100:400]
+    with pytest.raises(RegistrationError, match="still"):
+        stitch(screens, PointDetector(1000))

@@ -9,16 +9,17 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ..._shared.alpha import continued
-from ..._shared.errors import OptionError, check_name
+from ..._shared.errors import OptionError, RegistrationError, check_name
 from ..._shared.image_array import Channels, from_16_bits, to_8_bits
 from ..._shared.options import check_ranges, suggest_keywords, whole
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
-from ...io.image import load_pixels, one_range
+from ...io.image import load_pixels, luma, one_range
 from ...io.image_file import read_with
 from ..guided.tentative_matches import MAX_SIDE_PX
+from ..overlay import find_overlay
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .canvas import Canvas, least_distorted, plan_curved, plan_plane
 from .compositing import composite, crop_box
@@ -185,6 +186,11 @@ def stitch(
             sizes[number] = (rgb.shape[1], rgb.shape[0])
             small[number] = downscale(to_8_bits(rgb), options.registration_side)
         del rgb
+    if still := find_overlay([luma(rgb) for rgb, _ in small.values()], seed).mean():
+        raise RegistrationError(
+            f"{still:.1%} of all images stands still while the scene moves (a header, a caption, a "
+            "logo): crop it off"
+        )
     with timer.stage("registration"):
         registration = register_images(
             [rgb for rgb, _ in small.values()],

@@ -1,0 +1,85 @@
+"""Find the uniform frame of an image, and fill what is no part of the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .._shared.opencv import cv2
+
+MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
+MIN_SMOOTH_SHARE = 0.7
+"""Pixels of a frame differ from its colour by at most this number of grey levels in each channel,
+about what JPEG leaves; the first share of the outermost pixels has exactly this colour. Each part
+covers the second share of the image, one row of 500. The scene covers the third share; a video in
+portrait format covers 0.32 of one in landscape format. The scene, or each part of the frame,
+reaches `MIN_SMOOTH_SHARE` of the outline of its convex hull, up to `FRAME_MARGIN_PX`: a scene may
+partly have the colour of the frame, but a skyline does not reach so much."""
+
+FRAME_MARGIN_PX = 8
+"""Pixels up to this far from a frame or overlay belong to it, because keypoints there would show
+its edge. JPEG spreads an edge over blocks of this side."""
+
+
+def uniform_frame(rgb: np.ndarray) -> np.ndarray:
+    """Return where a (H, W, 3) uint8 image is a uniform frame, (H, W) bool.
+
+    A frame has one colour, reaches the border of the image, and ends in a smooth line: letter
+    boxes, corners of rotated or undistorted images, the surroundings of a round lens.
+    """
+    nowhere = np.zeros(rgb.shape[:2], bool)
+    ring = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
+    values, counts = np.unique(ring @ np.array([65536, 256, 1]), return_counts=True)
+    if counts.max() < MIN_RING_SHARE * len(ring):
+        return nowhere
+    colour = (values[counts.argmax()] >> np.array([16, 8, 0]) & 255).astype(np.float64)
+    flat = cv2.inRange(rgb, colour - MAX_FRAME_NOISE, colour + MAX_FRAME_NOISE)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
+    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    parts = [k for k in border if k and stats[k, cv2.CC_STAT_AREA] >= MIN_FRAME_SHARE * flat.size]
+    scene = cv2.morphologyEx(
+        (~np.isin(labels, parts)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))
+    )
+    hull, smooth = _convex_hull(scene)
+    frame = ~hull
+    if not (smooth and frame.any()):
+        frame = np.isin(
+            labels, [k for k in parts if _convex_hull((labels == k).astype(np.uint8))[1]]
+        )
+    sides = [frame[0].any(), frame[-1].any(), frame[:, 0].any(), frame[:, -1].any()]
+    # A sky may be as uniform, but it does not reach all four sides, and is not black.
+    if sum(sides) < (4 if colour.any() else 3) or frame.mean() > 1 - MIN_SCENE_SHARE:
+        return nowhere
+    return widened(frame, FRAME_MARGIN_PX)
+
+
+def _convex_hull(region: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the convex hull of a region as (H, W) bool, and whether its outline is smooth."""
+    hull, outline = np.zeros_like(region), np.zeros_like(region)
+    if (points := cv2.findNonZero(region)) is None:
+        return hull > 0, False
+    corners = cv2.convexHull(points)
+    cv2.fillConvexPoly(hull, corners, 1)
+    cv2.polylines(outline, [corners], True, 1)
+    inner = outline[1:-1, 1:-1] > 0
+    reached = widened(region, FRAME_MARGIN_PX)[1:-1, 1:-1][inner]
+    return hull > 0, bool(len(reached) and reached.mean() >= MIN_SMOOTH_SHARE)
+
+
+def widened(mask: np.ndarray, radius_px: int) -> np.ndarray:
+    """Return a (H, W) bool mask with all pixels up to `radius_px` away in x and in y."""
+    side = 2 * radius_px + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+
+
+def filled_smoothly(gray: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Replace the pixels of a (H, W) uint8 image inside a mask by smooth averages of the others."""
+    if not mask.any():
+        return gray
+    levels = [(gray * np.float32(~mask), np.float32(~mask))]
+    while min(levels[-1][1].shape) > 1:
+        levels.append((cv2.pyrDown(levels[-1][0]), cv2.pyrDown(levels[-1][1])))
+    values = np.full((1, 1), gray[~mask].mean() if not mask.all() else 0, np.float32)
+    for total, weight in reversed(levels):
+        coarse = cv2.resize(values, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        values = total + coarse * (1 - weight)
+    return np.where(mask, np.rint(values).clip(0, 255).astype(np.uint8), gray)

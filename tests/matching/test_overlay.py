@@ -1,0 +1,142 @@
+"""What stands still over images whose scene moves, and what only looks so."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+
+from deepdetect import PointDetector, match_images, register
+from deepdetect.matching.overlay import find_overlay
+
+WHITE = (255, 255, 255)
+
+
+def bonnet(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """Return a mask of the curved lower part of an image, which then shows a photograph."""
+    height, width = image.shape[:2]
+    mask = np.zeros((height, width), np.uint8)
+    cv2.ellipse(mask, (width // 2, height), (width // 2, height // 4), 0, 0, 360, 1, -1)
+    image[mask > 0] = cv2.resize(photo, (width, height))[mask > 0]
+    return mask > 0
+
+
+def caption(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    before = image.copy()
+    cv2.putText(image, "12:04:31 CAM 1", (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, WHITE, 2)
+    return (image != before).any(axis=2)
+
+
+def logo(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    image[120:180, 170:230] = photo[60:120, 90:150]
+    mask = np.zeros(image.shape[:2], bool)
+    mask[120:180, 170:230] = True
+    return mask
+
+
+def watermark(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    text = np.zeros_like(image)
+    cv2.putText(text, "SAMPLE", (110, 170), cv2.FONT_HERSHEY_SIMPLEX, 1.6, WHITE, 6)
+    mask = text.any(axis=2)
+    image[mask] = 0.4 * image[mask] + 0.6 * 255
+    return mask
+
+
+def display(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    before = image.copy()
+    for x, text in ((10, "ALT 120"), (300, "SPD 33")):
+        cv2.putText(image, text, (x, 280), cv2.FONT_HERSHEY_PLAIN, 1.4, (90, 255, 90), 2)
+    cv2.drawMarker(image, (200, 150), (90, 255, 90), cv2.MARKER_CROSS, 40, 2)
+    return (image != before).any(axis=2)
+
+
+def gray(image: np.ndarray) -> np.ndarray:
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def compressed(image: np.ndarray, quality: int = 80) -> np.ndarray:
+    return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], 1)
+
+
+@pytest.mark.parametrize("drawn", [bonnet, caption, logo, watermark, display])
+def test_an_overlay_is_found_and_little_else(drawn, facade, photo: np.ndarray) -> None:
+    scene = facade(0.3)
+    views = [np.array(scene.left), np.array(scene.right)]
+    masks = [drawn(view, photo) for view in views]
+    found = find_overlay([gray(compressed(view)) for view in views])
+    assert found[masks[0] & masks[1]].mean() > 0.6
+    around = cv2.dilate(np.uint8(masks[0]), np.ones((81, 81))) > 0
+    assert not (found & ~around).any()
+
+
+def test_a_scene_without_an_overlay_has_none(facade) -> None:
+    scene = facade(0.3)
+    assert not find_overlay([gray(scene.left), gray(scene.right)]).any()
+
+
+def test_what_moves_before_a_still_camera_is_no_reason_to_leave_out_the_rest(
+    photo: np.ndarray,
+) -> None:
+    background = cv2.resize(skimage.data.coffee(), (400, 300))
+    views = [background.copy() for _ in range(2)]
+    for view, x in zip(views, (60, 90), strict=True):
+        view[80:220, x : x + 150] = photo[60:200, 40:190]
+    noise = np.random.default_rng(0).normal(0, 3, (300, 400))
+    views[1] = (0.7 * views[1] + noise[..., None]).clip(0, 255).astype(np.uint8)
+    assert not find_overlay([gray(view) for view in views]).any()
+    assert not find_overlay([gray(background), gray(background)]).any()
+
+
+@pytest.mark.parametrize("baseline", [0.01, 0.03])
+def test_a_small_baseline_keeps_the_far_parts(baseline: float, photo: np.ndarray) -> None:
+    # The far half, ten times as far, moves by less than a pixel; the near half by some.
+    focal, views = 400.0, []
+    far, near = cv2.resize(skimage.data.coffee(), (440, 340)), cv2.resize(photo, (440, 340))
+    for eye in (0.0, baseline):
+        view = np.empty((300, 400, 3), np.uint8)
+        for texture, rows, depth in ((far, slice(0, 150), 10.0), (near, slice(150, 300), 1.0)):
+            move = np.float32([[1, 0, -20 - focal * eye / depth], [0, 1, -20]])
+            view[rows] = cv2.warpAffine(texture, move, (400, 300), flags=cv2.INTER_CUBIC)[rows]
+        views.append(view)
+    found = find_overlay([gray(view) for view in views])
+    assert not found.any()
+
+
+def test_an_overlay_over_many_images_stands_still_in_all(facade, photo: np.ndarray) -> None:
+    scene = facade(0.3)
+    views = [np.array(each) for each in (scene.left, scene.right, scene.left[:, ::-1])]
+    masks = [caption(view, photo) for view in views]
+    grays = [gray(view) for view in views]
+    assert find_overlay(grays)[masks[0]].mean() > 0.5
+    plain = gray(cv2.resize(skimage.data.coffee(), (400, 300)))
+    assert not find_overlay([*grays, plain]).any()
+
+
+def test_matches_are_of_the_scene_and_say_what_was_left_out(facade, photo: np.ndarray) -> None:
+    scene = facade(0.3)
+    views = [np.array(scene.left), np.array(scene.right)]
+    for view in views:
+        bonnet(view, photo)
+    with pytest.warns(UserWarning, match="still"):
+        matches = match_images(*views, PointDetector(2000))
+    assert matches.success
+    assert 0.1 < matches.geometry.evidence.left_out < 0.4
+    moved = np.linalg.norm(matches.points1 - matches.points0, axis=1)
+    assert (moved < 1).mean() < 0.01
+    expected = scene.match(matches.points0)
+    assert np.median(np.linalg.norm(matches.points1 - expected, axis=1)) < 1
+    assert (
+        match_images(scene.left, scene.right, PointDetector(2000)).geometry.evidence.left_out == 0
+    )
+
+
+def test_registration_follows_the_scene_below_a_still_header(photo: np.ndarray) -> None:
+    page = cv2.resize(skimage.data.coffee(), (300, 400))
+    views = [page[:300].copy(), page[60:360].copy()]
+    for view in views:
+        view[:90] = cv2.resize(photo[:64], (300, 90))
+    with pytest.warns(UserWarning, match="still"):
+        found = register(*views, PointDetector(2000))
+    expected = np.array([[1, 0, 0], [0, 1, -60], [0, 0, 1]])
+    assert np.abs(found.homography / found.homography[2, 2] - expected).max() < 0.5
