@@ -112,16 +112,33 @@ def test_a_plane_that_moves_otherwise_keeps_its_matches_and_spoils_no_others(
 
 
 def test_of_two_motions_alike_in_size_neither_is_trusted_highly(photo: np.ndarray) -> None:
-    # A view that turns within a frame that stands still.
+    # A view that turns within a frame that moves by itself.
     column, row = np.meshgrid(np.arange(256), np.arange(256))
     through = (np.hypot(column - 128, row - 128) < 100)[..., None]
-    frame, turn = photo[::-1, ::-1], cv2.getRotationMatrix2D((128, 128), 20, 1)
-    views = photo, cv2.warpAffine(photo, turn, (256, 256), flags=cv2.INTER_CUBIC)
-    matches = match(*(np.where(through, view, frame) for view in views), Everywhere())
-    for motion in (np.eye(3), np.vstack([turn, [0, 0, 1]])):
-        errors = transfer_errors(matches.points0, matches.points1, motion)
+    shift, turn = np.float64([[1, 0, 7], [0, 1, 4]]), cv2.getRotationMatrix2D((128, 128), 20, 1)
+    frame = photo[::-1, ::-1]
+    moved, turned = (
+        cv2.warpAffine(image, by, (256, 256), flags=cv2.INTER_CUBIC)
+        for image, by in ((frame, shift), (photo, turn))
+    )
+    views = (np.where(through, photo, frame), np.where(through, turned, moved))
+    matches = match(*views, Everywhere())
+    for motion in (shift, turn):
+        errors = transfer_errors(matches.points0, matches.points1, np.vstack([motion, [0, 0, 1]]))
         assert 0.33 < (errors < 1).mean() < 0.67
     assert matches.geometry.confidence == "fair"
+
+
+def test_a_frame_that_stands_still_is_no_motion(photo: np.ndarray) -> None:
+    column, row = np.meshgrid(np.arange(256), np.arange(256))
+    through = (np.hypot(column - 128, row - 128) < 100)[..., None]
+    turn = cv2.getRotationMatrix2D((128, 128), 20, 1)
+    turned = cv2.warpAffine(photo, turn, (256, 256), flags=cv2.INTER_CUBIC)
+    views = (np.where(through, view, photo[::-1, ::-1]) for view in (photo, turned))
+    with pytest.warns(UserWarning, match="stands still"):
+        matches = match(*views, Everywhere())
+    errors = transfer_errors(matches.points0, matches.points1, np.vstack([turn, [0, 0, 1]]))
+    assert (errors < 1).mean() > 0.95
 
 
 @pytest.mark.slow
