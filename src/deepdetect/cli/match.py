@@ -27,6 +27,7 @@ from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image
 from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_picture
+from ..io.projection import load_pinhole
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
 from ..matching.registration import register as register_images
@@ -119,7 +120,9 @@ def match(
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
     stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
-    load = lru_cache(2)(load_image)  # successive pairs share an image
+    of_pinholes = partial(load_pinhole, rim=unguided)
+    flat = values.get("model") == "homography"
+    load = lru_cache(2)(load_image if flat else of_pinholes)  # successive pairs share an image
     found: list[dict[str, Any]] = []
     failures: list[str] = []
     with progress(len(outputs), "matching", "pair", quiet=not many) as bar:
@@ -365,7 +368,7 @@ def stitch(
     failures: list[str] = []
     for path in paths:
         with noted_failures(str(path), failures):
-            load_image(path)
+            load_pinhole(path, rim=True)
             carried.append(read_metadata(path, placed=flat))
             images.append(path)
     if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.errors import ImageError, OptionError
 from .._shared.image_array import Channels
 from .._shared.machine import require_memory
 from .._shared.options import suggest_keywords
@@ -30,6 +30,7 @@ from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, ignore_masks, load_image, luma
+from ..io.projection import ROUND, is_round, load_pinhole
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 
@@ -88,7 +89,8 @@ def match_images(
         there are no matches, and `Matches.success` is False.
 
     Raises:
-        ImageError: an image cannot be read or is unsuitable.
+        ImageError: an image cannot be read, or is a panorama or a fisheye picture, to which only
+            the model "homography" may apply.
         OptionError: an option is unknown or out of its range.
 
     Example:
@@ -106,7 +108,8 @@ def match_images(
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
     masks = ignore_masks(ignore, 2)
-    rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
+    load = load_image if model == "homography" else load_pinhole
+    rgb = load(image0, channels=channels), load(image1, channels=channels)
     grays = luma(rgb[0]), luma(rgb[1])
     timer = StageTimer(progress)
     find = [
@@ -117,6 +120,9 @@ def match_images(
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     settings = guiding, model, seed, options, keypoints_last, timer
     matches = _match_guided(grays, (find[0], find[1]), source, *settings)
+    bent = matches.geometry is not None and matches.geometry.model in ("fundamental", "essential")
+    if bent and any(map(is_round, grays)):  # through an eyepiece, a plane fits a homography
+        raise ImageError(f"an image {ROUND}")
     if not (mutual and matches.success):
         return matches
     if source is not None:

@@ -27,7 +27,8 @@ from ..geometry.estimation import GeometryOptions, check_model
 from ..geometry.images import window_sums
 from ..geometry.relative_pose import RelativePose
 from ..io.exif import calibration_from_exif
-from ..io.image import Images, ignore_masks, load_image, luma
+from ..io.image import Images, ignore_masks, luma
+from ..io.projection import load_pinhole
 from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .outliers import PointFilterOptions
@@ -320,7 +321,7 @@ def _load_pair(
     focal_px: float | None,
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], Calibration]:
     """Load two images; return them as RGB and as luma, and their calibration."""
-    rgb = load_image(images[0], channels=channels), load_image(images[1], channels=channels)
+    rgb = load_pinhole(images[0], channels, rim=True), load_pinhole(images[1], channels, rim=True)
     grays = luma(rgb[0]), luma(rgb[1])
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     return rgb, grays, _calibration(calibration, focal_px, images, sizes)

@@ -41,6 +41,7 @@ from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .depth_maps import MATCHED_NEIGHBOURS, depth_map, find_references, limited_view
 from .formats import FormatName
 from .fusion import fuse_depth_maps, merge_dense_points
+from .lens_check import require_pinholes
 from .mapping import (
     RegisteredImage,
     SparseModel,
@@ -340,6 +341,8 @@ class Stages:
                     # A second attempt counts images again, so the bar is kept from overflowing.
                     lambda count: bar.update(min(count, len(images) - bar.n)),
                 )
+        if not known:
+            require_pinholes(model)
         model = correct_places(model, database, folder, known, self.seed, self.quiet)
         if refined:
             refine_tracks(model, folder, self.quiet)

@@ -16,6 +16,7 @@ from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_deep
+from ...io.projection import require_pinhole
 from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .canvas import Canvas, least_distorted, plan_curved, plan_plane
@@ -176,6 +177,7 @@ def stitch(
     with timer.stage("reading"):
         for number, image in enumerate(images):
             rgb = to_8_bits(load_deep(image, channels))
+            require_pinhole(image, rgb)
             sizes[number] = (rgb.shape[1], rgb.shape[0])
             small[number] = downscale(rgb, options.registration_side)
         del rgb
