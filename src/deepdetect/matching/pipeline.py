@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import ImageError, OptionError
+from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.machine import require_memory
 from .._shared.options import suggest_keywords
@@ -29,8 +29,8 @@ from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import Images, ignore_masks, load_image, luma
-from ..io.projection import ROUND, is_round, load_pinhole
+from ..io.image import Images, ignore_masks, image_named, load_image, luma
+from ..io.projection import load_pinhole, require_pinhole
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 
@@ -120,9 +120,10 @@ def match_images(
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     settings = guiding, model, seed, options, keypoints_last, timer
     matches = _match_guided(grays, (find[0], find[1]), source, *settings)
-    bent = matches.geometry is not None and matches.geometry.model in ("fundamental", "essential")
-    if bent and any(map(is_round, grays)):  # through an eyepiece, a plane fits a homography
-        raise ImageError(f"an image {ROUND}")
+    if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
+        for number, image in enumerate((image0, image1)):
+            with image_named(number):
+                require_pinhole(image, rgb[number])  # no eyepiece: no homography fits
     if not (mutual and matches.success):
         return matches
     if source is not None:

@@ -6,7 +6,6 @@ output folder. So the same call continues an interrupted run, even if images hav
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,13 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import (
-    DeepDetectError,
-    ImageError,
-    NoDepthError,
-    OptionError,
-    ReconstructionError,
-)
+from .._shared.errors import NoDepthError, OptionError, ReconstructionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
 from ..batch.pair_list import Pair
@@ -31,10 +24,7 @@ from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, Camera, PosedView, check_camera_file
 from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
-from ..io.image import load_image
-from ..io.image_file import open_image
 from ..io.point_cloud import save_point_cloud
-from ..io.projection import why_no_pinhole
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras
 from .formats import FORMATS, FormatName, check_formats
 from .fusion import DENSE_POINT
@@ -99,11 +89,10 @@ def reconstruct_many(
         Cameras and points. `unregistered` gives the images left out, each with the reason.
 
     Raises:
-        ImageError: the folder is missing or holds no image, or too few that are no panorama and
-            no fisheye picture.
+        ImageError: the folder is missing or holds no image.
         OptionError: an option is unknown or out of range, or differs from that of an earlier run.
         ReconstructionError: fewer than three images can be used.
-        NoDepthError: the images do not overlap enough, do not determine depth, or are of a fisheye.
+        NoDepthError: the images do not overlap enough, or do not determine depth.
         MissingExtraError: pycolmap or h5py is not installed.
 
     Example:
@@ -122,12 +111,9 @@ def reconstruct_many(
     folder = stages.folder_of(images)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
         require_fixes(folder, f"the format {placed[0]}")
-    bent = _no_pinholes(folder)
     timer = StageTimer()
     with timer.stage("features"):
         sizes, keypoints, unregistered = stages.extract(folder, detector, selection)
-    sizes = {name: size for name, size in sizes.items() if name not in bent}
-    unregistered |= bent
     sizes, known = _usable_images(sizes, keypoints, calibration, unregistered)
     with timer.stage("matching"):
         matches, alike = stages.match_images(sizes)
@@ -208,28 +194,6 @@ def _check_arguments(
     return control
 
 
-def _no_pinholes(folder: Path) -> dict[str, str]:
-    """Return, by name, why images below a folder are those of no pinhole.
-
-    A round rim is looked for in one image of each size, and if it is there, in all of that size.
-    """
-    found, round_sizes = {}, dict[tuple[int, int], bool]()
-    images = check_images(folder)
-    for name, path in images.items():
-        with contextlib.suppress(DeepDetectError):  # the features name what cannot be read
-            with open_image(path) as opened:
-                width, height = size = opened.size
-            looked = width == 2 * height or round_sizes.get(size, True)
-            reason = why_no_pinhole(path, load_image(path) if looked else None)
-            round_sizes.setdefault(size, reason is not None)
-            if reason is not None:
-                found[name] = f"it {reason}"
-    if found and len(images) - len(found) < MIN_VIEWS:
-        name, reason = next(iter(found.items()))
-        raise ImageError(f"{folder / name} {reason.removeprefix('it ')}")
-    return found
-
-
 def _usable_images(
     sizes: Mapping[str, tuple[int, int]],
     keypoints: Mapping[str, int],
@@ -238,7 +202,7 @@ def _usable_images(
 ) -> tuple[dict[str, tuple[int, int]], Mapping[str, Camera]]:
     """Return the sizes and known cameras of usable images; add the others to `unregistered`."""
     for name, count in keypoints.items():
-        if count < MIN_KEYPOINTS and name in sizes:
+        if count < MIN_KEYPOINTS:
             unregistered[name] = (
                 f"it has only {count} keypoints: it is black, blurred, or has no texture"
             )

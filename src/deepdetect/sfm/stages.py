@@ -35,13 +35,13 @@ from ..features.keypoints import Keypoints
 from ..features.match_filter import suits_filter
 from ..features.selection import SelectionOptions
 from ..geometry.camera import PosedView
-from ..io.image import find_images, name_images
+from ..io.image import find_images, load_image, name_images
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
+from ..io.projection import require_pinhole
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .depth_maps import MATCHED_NEIGHBOURS, depth_map, find_references, limited_view
 from .formats import FormatName
 from .fusion import fuse_depth_maps, merge_dense_points
-from .lens_check import require_pinholes
 from .mapping import (
     RegisteredImage,
     SparseModel,
@@ -51,6 +51,7 @@ from .mapping import (
     map_images,
     normalise_model,
     read_sparse_model,
+    require_pinholes,
     verify_pairs,
 )
 from .misplaced import correct_places
@@ -217,9 +218,15 @@ class Stages:
         sizes, keypoints, failures = {}, {}, {}
         with open_hdf5(self.features) as file:
             described = {*feature_names(file)}
-            for name in check_images(folder):
+            for name, path in check_images(folder).items():
                 if name in described:
                     width, height = file[name]["image_size"][()]
+                    looked = width == 2 * height or not sizes  # for a rim: until one has none
+                    try:
+                        require_pinhole(path, load_image(path) if looked else None)
+                    except ValueError as error:
+                        failures[name] = str(error).replace(str(path), "it", 1)
+                        continue
                     sizes[name] = int(width), int(height)
                     keypoints[name] = len(file[name]["keypoints"])
                     continue
