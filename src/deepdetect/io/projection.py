@@ -20,7 +20,7 @@ IPHONE_PANORAMA = 6
 ROWS, SHARPEST, FAR = 512, 0.003, (1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2)
 """Edges meet if they differ less than any two columns at the distances FAR (of the width), and no
 more than neighbours without the SHARPEST part, which are outlines of things. A plain background is
-mostly wider than 1/16, so that its far columns are alike, too. Some ROWS are compared, because more
+mostly wider than 1/16, so that far columns are alike. Some ROWS are compared, because more
 take time."""
 
 SIDE_PX, BLACK, ROUNDNESS, MIN_DIAMETER = 128, 16, 0.97, 0.9
@@ -87,7 +87,9 @@ def edges_meet(gray: np.ndarray) -> bool:
     return all(
         np.abs(rows[0] - np.roll(rows[0], height)).mean()
         <= np.abs(rows[2:] - rows[:-2]).mean(axis=1).max()
-        for rows in map(np.float32, (gray[:depth], gray[: -depth - 1 : -1]))
+        for rows in (
+            np.asarray(gray[part], np.float32) for part in np.s_[:depth, : -depth - 1 : -1]
+        )
     )
 
 

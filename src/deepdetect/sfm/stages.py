@@ -215,7 +215,7 @@ class Stages:
         )
         if not self.features.exists():
             raise ReconstructionError("no image can be read: " + "; ".join(report.failures))
-        sizes, keypoints, failures = {}, {}, {}
+        sizes, keypoints, failures = dict[str, tuple[int, int]](), {}, {}
         with open_hdf5(self.features) as file:
             described = {*feature_names(file)}
             for name, path in check_images(folder).items():
