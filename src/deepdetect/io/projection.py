@@ -23,10 +23,10 @@ more than neighbours without the SHARPEST part, which are outlines of things. A 
 mostly wider than 1/16, so that far columns are alike. Some ROWS are compared, because more
 take time."""
 
-SIDE_PX, BLACK, ROUNDNESS, MIN_DIAMETER = 128, 16, 0.97, 0.9
+SIDE_PX, BLACK, ROUNDNESS = 128, 16, 0.97
 """An image is reduced to the shorter side SIDE_PX. If it is round, grey levels outside are up to
-BLACK (ITU-R BT.601), and it fills the other two parts of a circle (an octagon fills 0.90) and of
-the shorter side. The last two were chosen by hand."""
+BLACK (ITU-R BT.601), it fills at least this part of a circle (an octagon fills 0.90), and its
+diameter is the shorter side, to twice what is missing at 1. The last was chosen by hand."""
 
 CUT = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90:yaw=0 view.png"
 PANORAMA, FISHEYE = "e:flat", "fisheye:flat:ih_fov=180:iv_fov=180"
@@ -46,19 +46,15 @@ def require_pinhole(image: Any, rgb: np.ndarray | None, *, rim: bool = True) -> 
     picture on black is that of a fisheye. A plane seen through an eyepiece looks the same.
     """
     tags, projection, full = _metadata(image)
-    lens = f"{tags.get(Base.LensMake, '')} {tags.get(Base.LensModel, '')}".strip("\0 ")
+    lens = f"{tags.get(Base.LensMake, '')} {tags.get(Base.LensModel, '')}"
     gray = np.zeros((1, 1), np.uint8) if rgb is None else luma(rgb)
     how = CUT.format(file_name(image) if is_path(image) else "IMAGE", PANORAMA)
     if tags.get(Base.CustomRendered) == IPHONE_PANORAMA or (projection and not full):
         what, how = "part of a panorama by its metadata", "give the photographs it is made of"
-    elif projection:
-        what = "a full panorama by its metadata"
-    elif edges_meet(gray):
-        what = "of 2:1 and its left and right edges meet: a full panorama"
-    elif "fisheye" in re.sub(r"[\W_]", "", lens.lower()):
-        what, how = f"taken with the lens {lens}", how.replace(PANORAMA, FISHEYE)
-    elif rim and is_round(gray):
-        what, how = "round on black, as of a fisheye", how.replace(PANORAMA, FISHEYE)
+    elif projection or edges_meet(gray):
+        what = f"a full panorama ({'by its metadata' if projection else '2:1, and its edges meet'})"
+    elif "fisheye" in re.sub(r"[\W_]", "", lens.lower()) or (rim and is_round(gray)):
+        what, how = "a fisheye picture (round, or by its EXIF)", how.replace(PANORAMA, FISHEYE)
     else:
         return
     raise ImageError(f"{file_name(image)} is {what}, which no pinhole geometry fits: {how}")
@@ -84,24 +80,24 @@ def edges_meet(gray: np.ndarray) -> bool:
     if not far > unlike(width - 1)[0] <= np.quantile(unlike(1), 1 - SHARPEST):
         return False
     depth = 2 + int(height * FAR[0])
-    return all(
-        np.abs(rows[0] - np.roll(rows[0], height)).mean()
-        <= np.abs(rows[2:] - rows[:-2]).mean(axis=1).max()
-        for rows in (
-            np.asarray(gray[part], np.float32) for part in np.s_[:depth, : -depth - 1 : -1]
-        )
-    )
+    for rows in (gray[:depth].astype(np.float32), gray[: -depth - 1 : -1].astype(np.float32)):
+        steps = np.abs(rows[2:] - rows[:-2]).mean(axis=1)
+        if np.abs(rows[0] - np.roll(rows[0], height)).mean() > steps.max():
+            return False
+    return True
 
 
 def is_round(gray: np.ndarray) -> bool:
     """Return whether an (H, W) image is black outside a circle that just fits into it."""
-    if gray[[0, 0, -1, -1], [0, -1, 0, -1]].max() > BLACK or gray.max() <= BLACK:
+    if gray[[0, 0, -1, -1], [0, -1, 0, -1]].max() > BLACK:
         return False
     scale = SIDE_PX / min(gray.shape)
     small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    hull = cv2.convexHull(np.argwhere(small > BLACK).astype(np.int32).reshape(-1, 1, 2))
-    radius = 0.0 if hull is None else cv2.minEnclosingCircle(hull)[1]
-    fits = MIN_DIAMETER <= 2 * radius / SIDE_PX <= 2 - ROUNDNESS
+    if small.max() <= BLACK:
+        return False
+    hull = cv2.convexHull(np.argwhere(small > BLACK).astype(np.int32))
+    radius = cv2.minEnclosingCircle(hull)[1]
+    fits = abs(2 * radius / SIDE_PX - 1) <= 2 * (1 - ROUNDNESS)
     return bool(fits and cv2.contourArea(hull) >= ROUNDNESS * np.pi * radius**2)
 
 
