@@ -14,9 +14,6 @@ from .._shared.opencv import cv2
 from .image import load_image, luma
 from .image_file import RAW_SUFFIXES, file_name, is_file, is_path, open_image
 
-IPHONE_PANORAMA = 6
-"""EXIF CustomRendered of panoramas of iPhones. XMP has the projection of other panoramas."""
-
 ROWS, SHARPEST, FAR = 512, 0.003, (1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2)
 """Edges meet if they differ less than any two columns at the distances FAR (of the width), and no
 more than neighbours without the SHARPEST part, which are outlines of things. A plain background is
@@ -49,7 +46,8 @@ def require_pinhole(image: Any, rgb: np.ndarray | None, *, rim: bool = True) -> 
     lens = f"{tags.get(Base.LensMake, '')} {tags.get(Base.LensModel, '')}"
     gray = np.zeros((1, 1), np.uint8) if rgb is None else luma(rgb)
     how = CUT.format(file_name(image) if is_path(image) else "IMAGE", PANORAMA)
-    if tags.get(Base.CustomRendered) == IPHONE_PANORAMA or (projection and not full):
+    iphone = tags.get(Base.CustomRendered) == 6  # for panoramas; the standard has only 0 and 1
+    if iphone or (projection and not full):
         what, how = "part of a panorama by its metadata", "give the photographs it is made of"
     elif projection or edges_meet(gray):
         what = f"a full panorama ({'by its metadata' if projection else '2:1, and its edges meet'})"
