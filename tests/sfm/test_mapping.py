@@ -19,6 +19,7 @@ from deepdetect.sfm.mapping import (
     map_images,
     normalise_model,
     read_sparse_model,
+    require_pinholes,
     verify_pairs,
 )
 
@@ -233,3 +234,69 @@ def test_all_poses_at_once_and_the_smaller_scene_apart(tmp_path: Path) -> None:
     assert {view.camera.focal_px for view in views} == {(500, 500)}  # known, so it stays
     pointing = views[0].rotation @ (views[-1].centre - views[0].centre)
     np.testing.assert_allclose(pointing / np.linalg.norm(pointing), [1, 0, 0], atol=0.02)
+
+
+def model_seen_by(pycolmap, lens: str, params: list[float], degrees: float):
+    """A model of six images by a lens, with noise, bundle-adjusted as if by a pinhole."""
+    rng = np.random.default_rng(0)
+    camera = pycolmap.Camera(model=lens, width=640, height=480, params=params)
+    made = pycolmap.Reconstruction()
+    start = CameraIntrinsics("SIMPLE_RADIAL", (640, 480), (400.0, 320.0, 240.0, -0.1))
+    assumed = start.colmap_camera()
+    assumed.camera_id = 1
+    made.add_camera_with_trivial_rig(assumed)
+    points = rng.uniform((-6, -4, 1), (6, 4, 6), (600, 3))
+    tracks: dict[int, list[tuple[int, int]]] = {}
+    for number in range(1, 7):
+        turn = pycolmap.Rotation3d(np.array([0.1, 0.3 - 0.1 * number, 0.3 * number]))
+        place = np.array([0.5 * number - 1.5, 0.2 * (number % 3), -1.0])
+        pose = pycolmap.Rigid3d(turn, -turn.matrix() @ place)
+        seen = points @ turn.matrix().T + pose.translation
+        rows = np.flatnonzero(
+            seen[:, 2] > np.linalg.norm(seen, axis=1) * np.cos(np.radians(degrees))
+        )
+        xy = camera.img_from_cam(np.ascontiguousarray(seen[rows]))
+        inside = ((xy > 0) & (xy < (640, 480))).all(axis=1)
+        rows, xy = rows[inside], xy[inside] + rng.normal(0, 0.3, (inside.sum(), 2))
+        image = pycolmap.Image(name=f"{number}.jpg", keypoints=xy, camera_id=1, image_id=number)
+        made.add_image_with_trivial_frame(image, pose)
+        for k, row in enumerate(rows):
+            tracks.setdefault(int(row), []).append((number, k))
+    for row, places in tracks.items():
+        if len(places) > 2:
+            track = pycolmap.Track()
+            for number, k in places:
+                track.add_element(number, k)
+            made.add_point3D(points[row], track)
+    adjust(made, known_cameras=False)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("lens", "params", "degrees"),
+    [
+        ("OPENCV_FISHEYE", [382.0, 382, 320, 240, 0, 0, 0, 0], 60),
+        ("OPENCV_FISHEYE", [270.0, 270, 320, 240, 0, 0, 0, 0], 84),
+        ("OPENCV_FISHEYE", [330.0, 330, 320, 240, -1 / 24, 1 / 1920, 0, 0], 72),  # equisolid
+    ],
+)
+def test_a_fisheye_is_no_pinhole(pycolmap, lens, params, degrees) -> None:
+    with pytest.raises(NoDepthError, match="fisheye"):
+        require_pinholes(model_seen_by(pycolmap, lens, params, degrees))
+
+
+@pytest.mark.parametrize(
+    ("lens", "params", "degrees"),
+    [
+        ("SIMPLE_RADIAL", [400.0, 320, 240, -0.3], 44),
+        ("SIMPLE_RADIAL", [340.0, 320, 240, -0.15], 55),
+        ("SIMPLE_PINHOLE", [231.0, 320, 240], 70),
+        ("OPENCV", [430.0, 430, 321, 242, -0.12, 0.09, 0.0003, 0.0003], 50),
+    ],
+)
+def test_distorting_lenses_stay_pinholes(pycolmap, lens, params, degrees) -> None:
+    made = model_seen_by(pycolmap, lens, params, degrees)
+    before = [*made.cameras[1].params]
+    require_pinholes(made)
+    assert [*made.cameras[1].params] == before
+    assert made.cameras[1].model_name == "SIMPLE_RADIAL"

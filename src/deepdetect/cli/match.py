@@ -27,6 +27,7 @@ from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image, load_pixels, one_range
 from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_picture
+from ..io.projection import require_pinhole
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
 from ..matching.registration import register as register_images
@@ -119,7 +120,15 @@ def match(
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
     stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
-    load = lru_cache(2)(load_pixels)  # successive pairs share an image
+    flat = values.get("model") == "homography"
+
+    @lru_cache(2)  # successive pairs share an image
+    def load(path: Path) -> np.ndarray:
+        pixels = load_pixels(path)
+        if not flat:
+            require_pinhole(path, pixels[:, :, :3], rim=unguided)
+        return pixels
+
     found: list[dict[str, Any]] = []
     failures: list[str] = []
     seen = [*dict.fromkeys(inputs)]
@@ -370,7 +379,7 @@ def stitch(
     failures: list[str] = []
     for path in paths:
         with noted_failures(str(path), failures):
-            load_image(path)
+            require_pinhole(path, load_image(path))
             carried.append(read_metadata(path, placed=flat))
             images.append(path)
     if failures and len(paths) == 1:

@@ -29,7 +29,8 @@ from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import Images, at_pixels, load_pair
+from ..io.image import Images, at_pixels, image_named, load_pair
+from ..io.projection import require_pinhole
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 from .overlay import scene_of
@@ -89,7 +90,8 @@ def match_images(
         there are no matches, and `Matches.success` is False.
 
     Raises:
-        ImageError: an image cannot be read or is unsuitable.
+        ImageError: an image cannot be read, or is a panorama or a fisheye picture, to which only
+            the model "homography" may apply.
         OptionError: an option is unknown or out of its range.
 
     Example:
@@ -107,6 +109,8 @@ def match_images(
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
     rgb, masks = load_pair((image0, image1), channels, ignore)
+    if model != "homography":
+        _require_pinholes((image0, image1), rgb, rim=False)
     # The initial geometry does not use a network's keypoints, so they are detected after it; with
     # masks of the caller or transparent pixels, they are detected before.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
@@ -121,6 +125,8 @@ def match_images(
     settings = guiding, model, seed, options, keypoints_last, timer
     matches = _match_guided(grays, (find[0], find[1]), source, *settings)
     matches = _noted(_unmasked(matches, masks), left_out)
+    if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
+        _require_pinholes((image0, image1), rgb, rim=True)  # no eyepiece: no homography fits
     if not (mutual and matches.success):
         return matches
     if source is not None:
@@ -279,6 +285,13 @@ def _match_guided(
         matched.indices0,
         matched.indices1,  # type: ignore[arg-type]  # None: looked up later
     )
+
+
+def _require_pinholes(images: tuple[Any, Any], rgb: Points, *, rim: bool) -> None:
+    """Raise an ImageError, with its index, if one of two images is not by a pinhole camera."""
+    for number, image in enumerate(images):
+        with image_named(number):
+            require_pinhole(image, rgb[number], rim=rim)
 
 
 def _unmasked(matches: Matches, masks: Sequence[np.ndarray | None]) -> Matches:

@@ -28,6 +28,7 @@ from ..geometry.images import window_sums
 from ..geometry.relative_pose import RelativePose
 from ..io.exif import calibration_from_exif
 from ..io.image import Images, load_pair, luma
+from ..io.projection import require_pinhole
 from ..matching.overlay import scene_of
 from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
@@ -328,6 +329,8 @@ def _load_pair(
 ) -> tuple[Any, Any, tuple[np.ndarray, np.ndarray], Calibration]:
     """Load two images; return them as RGB, their masks, both as luma, and their calibration."""
     rgb, masks = load_pair(images, channels, ignore)
+    for image, pixels in zip(images, rgb, strict=True):
+        require_pinhole(image, pixels)
     grays = luma(rgb[0]), luma(rgb[1])
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     return rgb, masks, grays, _calibration(calibration, focal_px, images, sizes)

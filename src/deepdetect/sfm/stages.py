@@ -44,6 +44,7 @@ from ..geometry.camera import PosedView
 from ..io.image import find_images, load_image, luma, name_images, one_range
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with
 from ..io.masks import load_mask, save_mask
+from ..io.projection import require_pinhole
 from ..matching.overlay import find_overlay, tell_still
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .depth_maps import MATCHED_NEIGHBOURS, depth_map, find_references, limited_view
@@ -59,6 +60,7 @@ from .mapping import (
     map_images,
     normalise_model,
     read_sparse_model,
+    require_pinholes,
     verify_pairs,
 )
 from .misplaced import correct_places
@@ -244,12 +246,18 @@ class Stages:
         )
         if not self.features.exists():
             raise ReconstructionError("no image can be read: " + "; ".join(report.failures))
-        sizes, keypoints, failures = {}, {}, {}
+        sizes, keypoints, failures = dict[str, tuple[int, int]](), {}, {}
         with open_hdf5(self.features) as file:
             described = {*feature_names(file)}
-            for name in check_images(folder):
+            for name, path in check_images(folder).items():
                 if name in described:
                     width, height = file[name]["image_size"][()]
+                    looked = width == 2 * height or not sizes  # for a rim: until one has none
+                    try:
+                        require_pinhole(path, load_image(path) if looked else None)
+                    except ValueError as error:
+                        failures[name] = str(error).replace(str(path), "it", 1)
+                        continue
                     sizes[name] = int(width), int(height)
                     keypoints[name] = len(file[name]["keypoints"])
                     continue
@@ -371,6 +379,8 @@ class Stages:
                     # A second attempt counts images again, so the bar is kept from overflowing.
                     lambda count: bar.update(min(count, len(images) - bar.n)),
                 )
+        if not known:
+            require_pinholes(model)
         model = correct_places(model, database, folder, known, self.seed, self.quiet)
         if refined:
             refine_tracks(model, folder, self.quiet)

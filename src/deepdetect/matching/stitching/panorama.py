@@ -18,6 +18,7 @@ from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_pixels, luma, one_range
 from ...io.image_file import read_with
+from ...io.projection import require_pinhole
 from ..guided.tentative_matches import MAX_SIDE_PX
 from ..overlay import find_overlay
 from .bundle_adjustment import RotatingCamera, level_cameras
@@ -183,6 +184,7 @@ def stitch(
         for number, image in enumerate(images):
             rgb = continued(load_pixels(image, channels, deep=True))
             deep &= rgb.dtype == np.uint16
+            require_pinhole(image, to_8_bits(rgb)[:, :, :3])
             sizes[number] = (rgb.shape[1], rgb.shape[0])
             small[number] = downscale(to_8_bits(rgb), options.registration_side)
         del rgb
