@@ -28,6 +28,9 @@ def bad(tmp_path: Path, photos: Path) -> Path:
     (folder / "weights.safetensors").write_bytes(b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ")
     (folder / "weights.pth").write_bytes(b"\x80\x04K\x01.")
     Image.new("L", (15, 40)).save(folder / "small.png")
+    sphere = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
+    for name in "ab":
+        Image.new("RGB", (64, 32)).save(folder / f"sphere-{name}.jpg", xmp=sphere)
     (folder / "matrix.txt").write_text("1 2\n3 4\n")
     (folder / "video.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
     return folder
@@ -38,6 +41,11 @@ CASES = {
     "truncated png": "detect {bad}/truncated.png",
     "no image": "detect {bad}/text.png",
     "empty folder": "detect {bad}/empty",
+    "matching panoramas": "match {bad}/sphere-a.jpg {bad}/sphere-b.jpg",
+    "panoramas by descriptors": "match {bad}/sphere-a.jpg {bad}/sphere-b.jpg --unguided",
+    "pose of panoramas": "pose {bad}/sphere-a.jpg {bad}/sphere-b.jpg --focal 50",
+    "stitching panoramas": "stitch {bad}/sphere-a.jpg {bad}/sphere-b.jpg -o p.jpg",
+    "depth of panoramas": "reconstruct {bad}/sphere-a.jpg {bad}/sphere-b.jpg --focal 50",
     "small image": "detect {bad}/small.png",
     "missing weights": "detect {bad}/good.png --weights {bad}/no.onnx",
     "text as weights": "detect {bad}/good.png --weights {bad}/weights.onnx",
