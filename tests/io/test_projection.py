@@ -12,12 +12,18 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngInfo
 
-from deepdetect import ImageError
-from deepdetect.io.projection import edges_meet, is_round, load_pinhole
+from deepdetect import ImageError, load_image
+from deepdetect.io.projection import edges_meet, is_round, require_pinhole
 
 HEIGHT = 256
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description
  xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {}</rdf:Description></x:xmpmeta>"""
+
+
+def load_pinhole(image: object, *, rim: bool = False) -> np.ndarray:
+    rgb = load_image(image)
+    require_pinhole(image, rgb, rim=rim)
+    return rgb
 
 
 def brightness(rays: np.ndarray, seed: int = 0) -> np.ndarray:

@@ -120,15 +120,9 @@ def match(
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
     stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
+    of_pinholes = partial(_load_of_pinhole, rim=unguided)
     flat = values.get("model") == "homography"
-
-    @lru_cache(2)  # successive pairs share an image
-    def load(path: Path) -> np.ndarray:
-        pixels = load_pixels(path)
-        if not flat:
-            require_pinhole(path, pixels[:, :, :3], rim=unguided)
-        return pixels
-
+    load = lru_cache(2)(load_pixels if flat else of_pinholes)  # successive pairs share an image
     found: list[dict[str, Any]] = []
     failures: list[str] = []
     seen = [*dict.fromkeys(inputs)]
@@ -160,6 +154,12 @@ def match(
         "pairs",
         cli.NOTHING_FOUND if nothing else 0,
     )
+
+
+def _load_of_pinhole(path: Path, rim: bool) -> np.ndarray:
+    pixels = load_pixels(path)
+    require_pinhole(path, pixels[:, :, :3], rim=rim)
+    return pixels
 
 
 def _match_unguided(
