@@ -19,6 +19,7 @@ from ..geometry.images import (
     NOISE_STD,
     WINDOW_PX,
     downscale,
+    edge_strength,
     erode_mask,
     gaussian_blur,
     local_zncc,
@@ -46,7 +47,7 @@ SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
 
 SHIFTS = (1 / 6, 1 / 4)
-"""The second image is shifted by these fractions of the shorter side, in eight directions, to
+"""The second image is shifted by these fractions of the shorter side, in four directions, to
 measure how well unrelated content correlates. Chosen by hand."""
 
 MAX_SHIFTED_FRACTION = 0.25
@@ -233,21 +234,28 @@ def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
     A window that is flat in one image only is either a difference, as on boards and forms, or
     unknown, as in clipped shadows. Either view may show that the images agree.
     """
-    first, scale0 = downscale(gray0, COMPARED_SIDE_PX)
-    second, scale1 = downscale(gray1, COMPARED_SIDE_PX)
+    (first, scale0), (second, scale1) = (downscale(g, COMPARED_SIDE_PX) for g in (gray0, gray1))
     matrix = scaled_homography(homography, scale0, scale1)
-    own = _correlations(first, second, matrix)
-    lengths = [radius * min(first.shape) for radius in SHIFTS]
-    shifted = [
-        _correlations(first, second, matrix @ translation_matrix(x * length, y * length))
-        for length in lengths
+    # Images of two sensors, or a negative and its print, are alike in their edges only.
+    return _alike(first, second, matrix) or _alike(
+        edge_strength(first), edge_strength(second), matrix
+    )
+
+
+def _alike(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> bool:
+    """Return whether enough windows correlate better than in shifted copies."""
+    own = _correlations(first, second, homography)
+    moves = (
+        translation_matrix(x * radius * min(first.shape), y * radius * min(first.shape))
+        for radius in SHIFTS
         for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
-    ]
+    )
+    shifted = [_correlations(first, second, homography @ move) for move in moves]
     for aligned, *others in zip(own, *shifted, strict=True):
         chance = np.concatenate(others)
-        if len(aligned) and len(chance):
-            if np.median(aligned) > np.quantile(chance, 1 - MAX_SHIFTED_FRACTION):
-                return True
+        enough = len(aligned) > 0 and len(chance) > 0
+        if enough and np.median(aligned) > np.quantile(chance, 1 - MAX_SHIFTED_FRACTION):
+            return True
     return False
 
 

@@ -113,6 +113,7 @@ def stitch(
     projection: Projection = "plane",
     crop: bool = False,
     reference: int | None = None,
+    force: bool = False,
     seed: int = 0,
     options: StitchingOptions = StitchingOptions(),
     progress: Callable[[str], object] | None = None,
@@ -136,6 +137,7 @@ def stitch(
         crop: crop the panorama to the largest rectangle without black areas.
         reference: number of the undistorted image of a flat panorama, or of the middle image of a
             curved one; None chooses the image that distorts the others least.
+        force: make the panorama even if its pairs contradict each other; a warning then says so.
         seed: seed of all random choices.
         options: scale, size limit and registration size of the panorama.
         progress: called with the name of each stage (`stages_of`) when it ends.
@@ -148,7 +150,8 @@ def stitch(
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
         RegistrationError: no two images overlap, an image is too oblique to the reference for a
-            flat panorama, or the cameras of a curved panorama did not only rotate.
+            flat panorama, or the matches of a pair lie farther apart in the panorama than inliers
+            of a homography may.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -185,6 +188,7 @@ def stitch(
             DeepDetect() if detector is None else detector,
             reference=reference,
             turning=projection != "plane",
+            force=force,
             seed=seed,
             progress=progress,
         )

@@ -8,6 +8,7 @@ it but were not registered, are matched again starting from it, and the fit is r
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -22,9 +23,11 @@ from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints, detect_sift
 from ...geometry.transforms import transfer_errors, transform_points
+from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 from ...io.image import luma
 from ..guided import TentativeMatches, find_tentative_matches, guided_matches
 from ..guided.initial_geometry import InitialGeometry, estimate_initial_geometry
+from ..registration import agree
 from .bundle_adjustment import RegisteredPair, RotatingCamera, adjust_cameras, adjust_homographies
 
 SIFT_KEYPOINTS = 2000
@@ -50,8 +53,10 @@ MAX_DISAGREEMENT_PX = 2.0
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
-MAX_CAMERA_RESIDUAL_PX = 3.0
-"""Maximum RMS residual of cameras that only rotate; it is 0.2 to 1 px without parallax."""
+MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
+"""A pair contradicts the joint fit if its RMS distance from it exceeds the inlier threshold of a
+homography, since a typical match of the pair is then an outlier of the panorama. The distance is
+0.2 to 1 px if nothing is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +89,7 @@ def register_images(
     *,
     reference: int | None = None,
     turning: bool = False,
+    force: bool = False,
     seed: int = 0,
     progress: Callable[[str], object] | None = None,
 ) -> JointRegistration:
@@ -92,13 +98,14 @@ def register_images(
     SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
     without heat map do both. The largest group of connected images is registered, or the group that
     contains image number `reference`. If `turning`, cameras that only rotate are estimated as well.
+    If `force`, pairs that contradict their images or the result give a warning, not an error.
     """
     done = progress or (lambda _: None)
     views = []
     for image in images:
         views.append(_prepare(image, detector))
         done("keypoints")
-    pairs = _registered_pairs(views, seed, done)
+    pairs = _registered_pairs(views, force, seed, done)
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
         group = next(group for group in groups if reference in group)
@@ -122,19 +129,16 @@ def register_images(
     }
     pairs = [pair for pair in pairs if pair.first in group]
     sizes = {number: views[number].gray.shape[::-1] for number in group}
-    homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
-    to_common = homographies
-    if cameras is not None:
-        to_common = {n: one.to_common(sizes[n]) for n, one in cameras.items()}
-    again = _registered_again(views, to_common, pairs, seed)
+    homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
+    again = _registered_again(views, to_common, pairs, force, seed)
     if set(again) != set(pairs):
         pairs = again
-        homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
-    if turning and residual_px > MAX_CAMERA_RESIDUAL_PX:
-        raise RegistrationError(
-            f"the cameras of these images did not only rotate ({residual_px:.1f} px remain): "
-            "take all images from one place, or choose the projection 'plane'"
-        )
+        homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
+    reason = _contradiction(views, pairs, to_common, turning, force)
+    if reason is not None and not force:
+        raise RegistrationError(f"{reason} (or set `force`)")
+    if reason is not None:
+        warnings.warn(reason, UserWarning, stacklevel=3)
     counts = {(pair.first, pair.second): pair.matches for pair in pairs}
     return JointRegistration(homographies, cameras, counts, residual_px, unregistered)
 
@@ -144,13 +148,55 @@ def _adjust(
     pairs: Sequence[RegisteredPair],
     sizes: dict[int, tuple[int, int]],
     turning: bool,
-) -> tuple[dict[int, np.ndarray], dict[int, RotatingCamera] | None, float]:
-    """Fit all images of a group jointly to their pairs; also return the residual in pixels."""
+) -> tuple[dict[int, np.ndarray], dict[int, RotatingCamera] | None, dict[int, np.ndarray], float]:
+    """Fit all images of a group jointly to their pairs.
+
+    Returns homographies, cameras or None, the maps to the common frame of whichever counts, and the
+    residual in pixels.
+    """
     homographies, residual_px = adjust_homographies(_compose(group, pairs), pairs, sizes)
-    cameras = None
-    if turning:
-        cameras, residual_px = adjust_cameras(homographies, pairs, sizes)
-    return homographies, cameras, residual_px
+    if not turning:
+        return homographies, None, homographies, residual_px
+    cameras, residual_px = adjust_cameras(homographies, pairs, sizes)
+    to_common = {number: one.to_common(sizes[number]) for number, one in cameras.items()}
+    return homographies, cameras, to_common, residual_px
+
+
+def _contradiction(
+    views: Sequence[_Image],
+    pairs: Sequence[RegisteredPair],
+    to_common: dict[int, np.ndarray],
+    turning: bool,
+    force: bool,
+) -> str | None:
+    """Return the sentence on the pair that contradicts a joint fit most, or None if none does."""
+    worst = max(pairs, key=lambda pair: _disagreement_px(pair, to_common))
+    off_px = _disagreement_px(worst, to_common)
+    what = (
+        f"the matches of images[{worst.first}] and images[{worst.second}] are {off_px:.1f} px apart"
+    )
+    if off_px <= MAX_RESIDUAL_PX:
+        unlike = (
+            (pair.first, pair.second)
+            for pair in (pairs if force else ())  # otherwise, `_register` has looked at them
+            if not agree(views[pair.first].gray, views[pair.second].gray, pair.homography)
+        )
+        first, second = next(unlike, (None, None))
+        if first is None:
+            return None
+        what = f"images[{first}] and images[{second}] differ where they overlap"
+    hint = "choose the projection 'plane'" if turning else "crop what stands still in all images"
+    return (
+        f"the images contradict each other: in the panorama, {what}; take all from one place, "
+        f"leave one of these two out, or {hint}"
+    )
+
+
+def _disagreement_px(pair: RegisteredPair, to_common: dict[int, np.ndarray]) -> float:
+    """Return the RMS distance of a pair's own homography from a joint fit, at its matches."""
+    matrix = np.linalg.inv(to_common[pair.second]) @ to_common[pair.first]
+    expected = transform_points(pair.points, pair.homography)
+    return float(np.sqrt(np.mean(transfer_errors(pair.points, expected, matrix) ** 2)))
 
 
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
@@ -167,7 +213,7 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
 
 
 def _registered_pairs(
-    views: Sequence[_Image], seed: int, done: Callable[[str], object]
+    views: Sequence[_Image], force: bool, seed: int, done: Callable[[str], object]
 ) -> list[RegisteredPair]:
     overlaps: list[tuple[InitialGeometry, TentativeMatches, int, int]] = []
     for first, second in combinations(range(len(views)), 2):
@@ -184,14 +230,14 @@ def _registered_pairs(
         enough = min(partners[first], partners[second]) >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
-        pair = _register(views, first, second, geometry, seed)
+        pair = _register(views, first, second, geometry, force, seed)
         for _ in range(MAX_FURTHER_TRIALS):
             if pair is not None or geometry.matrix is None:
                 break
             # Most matches on repeated structure may be wrong, so the others are tried alone.
             tentative = tentative.apart_from(geometry.matrix)
             geometry = estimate_initial_geometry(tentative, "homography", seed)
-            pair = _register(views, first, second, geometry, seed)
+            pair = _register(views, first, second, geometry, force, seed)
         if pair is not None:
             pairs.append(pair)
             partners[first] += 1
@@ -200,15 +246,25 @@ def _registered_pairs(
 
 
 def _register(
-    views: Sequence[_Image], first: int, second: int, geometry: InitialGeometry, seed: int
+    views: Sequence[_Image],
+    first: int,
+    second: int,
+    geometry: InitialGeometry,
+    force: bool,
+    seed: int,
 ) -> RegisteredPair | None:
-    """Register a pair by dense matches guided by a geometry; return None if they reject it."""
+    """Register a pair by dense matches guided by a geometry; return None if they reject it.
+
+    Also return None if the aligned images reject it, unless `force`.
+    """
     if geometry.matrix is None:
         return None
     a, b = views[first], views[second]
     keypoints = a.keypoints, b.keypoints
     guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
     if guide.matrix is None or matches is None:
+        return None
+    if not force and not agree(a.gray, b.gray, guide.matrix):
         return None
     points = a.keypoints[matches.indices0]
     order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
@@ -220,6 +276,7 @@ def _registered_again(
     views: Sequence[_Image],
     to_common: dict[int, np.ndarray],
     pairs: Sequence[RegisteredPair],
+    force: bool,
     seed: int,
 ) -> list[RegisteredPair]:
     """Register pairs again, starting from the joint fit, if they disagree with it or are missing.
@@ -248,9 +305,7 @@ def _registered_again(
                 )
             )
         else:
-            expected = transform_points(pair.points, pair.homography)
-            off_px = transfer_errors(pair.points, expected, matrix)
-            good = bool(np.sqrt(np.mean(off_px**2)) < MAX_DISAGREEMENT_PX)
+            good = _disagreement_px(pair, to_common) < MAX_DISAGREEMENT_PX
         if not good:
             nowhere = np.empty((0, 2))
             geometry = InitialGeometry(
@@ -262,7 +317,7 @@ def _registered_again(
                 points1=nowhere,
                 others=None,
             )
-            again = _register(views, first, second, geometry, seed)
+            again = _register(views, first, second, geometry, force, seed)
             if again is not None:
                 partners[first].add(second)
                 partners[second].add(first)
