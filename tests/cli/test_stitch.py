@@ -137,6 +137,7 @@ def screens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("default::UserWarning")
 def test_images_that_contradict_each_other_are_written_by_force_only(screens: list[str]) -> None:
     refused(*screens, "-o", "page.png", code=3)
     assert not Path("page.png").exists()

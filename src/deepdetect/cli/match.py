@@ -385,7 +385,7 @@ def stitch(
         try:
             with (
                 stage_progress("stitching", stages_of(len(images))) as done,
-                warnings.catch_warnings(record=True) as caught,
+                warnings.catch_warnings(record=True, action="always") as caught,
             ):
                 panorama = stitch_images(
                     images,

@@ -209,10 +209,12 @@ def _plane_or_depth(
     plane = _trusted(first, matrix, on_plane, enough)
     evidence = replace(plane[0].evidence, verified=verified)
     plane = replace(plane[0], evidence=evidence), plane[1]
-    if first.cross_modal:
-        # In images of two sensors, patches that differ are no evidence of depth.
+    if first.cross_modal or first.parallax is None:
+        # In images of two sensors, patches that differ are no evidence of depth. In line drawings,
+        # unrelated patches look the same, and only the sparse matches are distinctive.
         if plane[1] is None:
-            plane = _sparsely(grays[0], pixels[0], first)
+            sparse = first if first.cross_modal else replace(first, matrix=matrix)
+            plane = _sparsely(grays[0], pixels[0], sparse)
         if plane[1] is not None:
             return plane
     clear = first.parallax is not None and first.parallax.log10_nfa < MAX_PARALLAX_LOG10_NFA

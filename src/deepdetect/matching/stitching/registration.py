@@ -266,7 +266,7 @@ def _register(
         return None
     if not force and not agree(a.gray, b.gray, guide.matrix):
         return None
-    points = a.keypoints[matches.indices0]
+    points = matches.starts(a.keypoints)
     order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
     spread = points[order[:MAX_CORRESPONDENCES]]
     return RegisteredPair(first, second, guide.matrix, spread, len(points))
