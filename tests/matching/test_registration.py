@@ -128,6 +128,9 @@ def test_a_union_is_limited_by_pixels_however_many_channels(shape: tuple[int, ..
         _union(shape, shape, np.diag([1 / 3, 1 / 3, 1]))
 
 
+FIELDS = ("Surname", "Date of birth", "Street 12", "Town", "Account no.", "Signed")
+
+
 def drawing(kind: str) -> np.ndarray:
     """A drawing with large flat parts, (480, 480) uint8."""
     page = np.full((480, 480), 255, np.uint8)
@@ -140,9 +143,9 @@ def drawing(kind: str) -> np.ndarray:
         cv2.circle(page, (290, 10), 22, 255, -1)
         cv2.rectangle(page, (340, 330), (370, 362), 0, -1)
     elif kind == "form":
-        for row in range(60, 420, 60):
+        for row, word in zip((70, 125, 200, 262, 350, 401), FIELDS, strict=True):
             cv2.line(page, (40, row), (440, row), 0, 2)
-            cv2.putText(page, f"Item {row // 7}", (50, row - 12), 0, 0.6, 0, 2)
+            cv2.putText(page, word, (50, row - 12), 0, 0.6, 0, 2)
         cv2.rectangle(page, (40, 20), (440, 440), 0, 2)
     else:
         page[:] = 230

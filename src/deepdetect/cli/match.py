@@ -340,9 +340,8 @@ def stitch(
     """Stitch overlapping images, taken from one place or showing one plane, to a panorama.
 
     The images may be in any order. Images that overlap no other, or cannot be read, are left out
-    and listed, with exit code 1. If the images contradict each other, nothing is written, and the
-    exit code is 3. Flat panoramas cover at most 100 to 120 degrees, cylindrical or spherical ones
-    360.
+    and listed, with exit code 1; if images contradict each other, nothing is written, with code 3.
+    Flat panoramas cover at most 100 to 120 degrees, cylindrical or spherical ones 360.
 
         deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
         deepdetect stitch photos/ --projection cylindrical --crop -o panorama.jpg
@@ -377,8 +376,7 @@ def stitch(
         raise ImageError(f"there is no panorama, because {what}: {'; '.join(failures)}")
     cli.check_outputs([file], paths)
 
-    def named(text: object) -> str:
-        """Return a message of `stitch` with the names of the images in place of their indices."""
+    def named(text: object) -> str:  # has indices in place of names
         return re.sub(r"images\[(\d+)\]", lambda found: str(images[int(found[1])]), str(text))
 
     with cli.writing({"file": file}, images, overwrite) as made:
@@ -403,10 +401,8 @@ def stitch(
         kept = replace(carried[panorama.reference], no_data=None).moved(moved)
         save_picture(panorama.image, made["file"], kept)
         kept.write_beside(file)
-    failures += [
-        f"{images[number]} is not in the panorama: {reason}"
-        for number, reason in panorama.unregistered.items()
-    ]
+    for number, reason in panorama.unregistered.items():
+        failures.append(f"{images[number]} is not in the panorama: {reason}")
     if panorama.parallax:
         (first, second), distance = max(panorama.parallax.items(), key=lambda item: item[1])
         cli.say(

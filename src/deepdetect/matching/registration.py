@@ -57,12 +57,10 @@ under the hardest light (HPatches i_pool, webcams by day and night), and 0.27 or
 from frames 5 m apart."""
 
 COMPARED_SIDE_PX = 1600
-"""Images are reduced to this longer side before they are compared: the homography was refined on
-copies of that size, and parallax shows in fine detail."""
+"""Images are reduced to this longer side, as for the refinement, before they are compared."""
 
 STEP_PX = WINDOW_PX // 3
-"""Distance in pixels between the compared windows. Windows overlap by two thirds, so that a closer
-step would hardly add content."""
+"""Distance in pixels between compared windows. They overlap so much that more add no content."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -237,9 +235,8 @@ def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
     (first, scale0), (second, scale1) = (downscale(g, COMPARED_SIDE_PX) for g in (gray0, gray1))
     matrix = scaled_homography(homography, scale0, scale1)
     # Images of two sensors, or a negative and its print, are alike in their edges only.
-    return _alike(first, second, matrix) or _alike(
-        edge_strength(first), edge_strength(second), matrix
-    )
+    edges = edge_strength(first), edge_strength(second)
+    return _alike(first, second, matrix) or _alike(*edges, matrix)
 
 
 def _alike(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> bool:

@@ -210,8 +210,7 @@ def _plane_or_depth(
     evidence = replace(plane[0].evidence, verified=verified)
     plane = replace(plane[0], evidence=evidence), plane[1]
     if first.cross_modal or first.parallax is None:
-        # In images of two sensors, patches that differ are no evidence of depth. In line drawings,
-        # unrelated patches look the same, and only the sparse matches are distinctive.
+        # Patches differ in images of two sensors, and unrelated ones are equal in line drawings.
         if plane[1] is None:
             sparse = first if first.cross_modal else replace(first, matrix=matrix)
             plane = _sparsely(grays[0], pixels[0], sparse)

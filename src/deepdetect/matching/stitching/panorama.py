@@ -150,8 +150,7 @@ def stitch(
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
         RegistrationError: no two images overlap, an image is too oblique to the reference for a
-            flat panorama, or the matches of a pair lie farther apart in the panorama than inliers
-            of a homography may.
+            flat panorama, or the images contradict each other.
 
     Example:
         >>> from deepdetect import PointDetector

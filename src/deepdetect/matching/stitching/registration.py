@@ -54,9 +54,8 @@ MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
-"""A pair contradicts the joint fit if its RMS distance from it exceeds the inlier threshold of a
-homography, since a typical match of the pair is then an outlier of the panorama. The distance is
-0.2 to 1 px if nothing is wrong."""
+"""A pair contradicts the joint fit if its RMS distance from it exceeds this inlier threshold of a
+homography: a typical match is then an outlier. The distance is 0.2 to 1 px if nothing is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +104,12 @@ def register_images(
     for image in images:
         views.append(_prepare(image, detector))
         done("keypoints")
-    pairs = _registered_pairs(views, force, seed, done)
+    pairs = _registered_pairs(views, seed, done)
+    unlike = [
+        p for p in pairs if not agree(views[p.first].gray, views[p.second].gray, p.homography)
+    ]
+    if not force:
+        pairs = [pair for pair in pairs if pair not in unlike]
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
         group = next(group for group in groups if reference in group)
@@ -129,15 +133,24 @@ def register_images(
     }
     pairs = [pair for pair in pairs if pair.first in group]
     sizes = {number: views[number].gray.shape[::-1] for number in group}
-    homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
-    again = _registered_again(views, to_common, pairs, force, seed)
-    if set(again) != set(pairs):
-        pairs = again
+    hint = "choose the projection 'plane'" if turning else "crop what stands still in all images"
+    try:
         homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
-    reason = _contradiction(views, pairs, to_common, turning, force)
-    if reason is not None and not force:
-        raise RegistrationError(f"{reason} (or set `force`)")
-    if reason is not None:
+        again = _registered_again(views, to_common, pairs, seed)
+        if set(again) != set(pairs):
+            pairs = again
+            homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
+    except np.linalg.LinAlgError:
+        raise RegistrationError(f"the images contradict each other: {hint}") from None
+    worst = max(pairs, key=lambda pair: _disagreement_px(pair, to_common))
+    off_px = _disagreement_px(worst, to_common)
+    for pair in [worst] if off_px > MAX_RESIDUAL_PX else unlike[: int(force)]:
+        reason = (
+            f"images[{pair.first}] and images[{pair.second}] contradict each other where they "
+            f"overlap ({off_px:.1f} px in the panorama): leave one of them out, or {hint}"
+        )
+        if not force:
+            raise RegistrationError(f"{reason} (or set `force`)")
         warnings.warn(reason, UserWarning, stacklevel=3)
     counts = {(pair.first, pair.second): pair.matches for pair in pairs}
     return JointRegistration(homographies, cameras, counts, residual_px, unregistered)
@@ -149,47 +162,13 @@ def _adjust(
     sizes: dict[int, tuple[int, int]],
     turning: bool,
 ) -> tuple[dict[int, np.ndarray], dict[int, RotatingCamera] | None, dict[int, np.ndarray], float]:
-    """Fit all images of a group jointly to their pairs.
-
-    Returns homographies, cameras or None, the maps to the common frame of whichever counts, and the
-    residual in pixels.
-    """
+    """Fit a group jointly; return homographies, cameras, maps to the common frame, residual."""
     homographies, residual_px = adjust_homographies(_compose(group, pairs), pairs, sizes)
     if not turning:
         return homographies, None, homographies, residual_px
     cameras, residual_px = adjust_cameras(homographies, pairs, sizes)
     to_common = {number: one.to_common(sizes[number]) for number, one in cameras.items()}
     return homographies, cameras, to_common, residual_px
-
-
-def _contradiction(
-    views: Sequence[_Image],
-    pairs: Sequence[RegisteredPair],
-    to_common: dict[int, np.ndarray],
-    turning: bool,
-    force: bool,
-) -> str | None:
-    """Return the sentence on the pair that contradicts a joint fit most, or None if none does."""
-    worst = max(pairs, key=lambda pair: _disagreement_px(pair, to_common))
-    off_px = _disagreement_px(worst, to_common)
-    what = (
-        f"the matches of images[{worst.first}] and images[{worst.second}] are {off_px:.1f} px apart"
-    )
-    if off_px <= MAX_RESIDUAL_PX:
-        unlike = (
-            (pair.first, pair.second)
-            for pair in (pairs if force else ())  # otherwise, `_register` has looked at them
-            if not agree(views[pair.first].gray, views[pair.second].gray, pair.homography)
-        )
-        first, second = next(unlike, (None, None))
-        if first is None:
-            return None
-        what = f"images[{first}] and images[{second}] differ where they overlap"
-    hint = "choose the projection 'plane'" if turning else "crop what stands still in all images"
-    return (
-        f"the images contradict each other: in the panorama, {what}; take all from one place, "
-        f"leave one of these two out, or {hint}"
-    )
 
 
 def _disagreement_px(pair: RegisteredPair, to_common: dict[int, np.ndarray]) -> float:
@@ -213,7 +192,7 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
 
 
 def _registered_pairs(
-    views: Sequence[_Image], force: bool, seed: int, done: Callable[[str], object]
+    views: Sequence[_Image], seed: int, done: Callable[[str], object]
 ) -> list[RegisteredPair]:
     overlaps: list[tuple[InitialGeometry, TentativeMatches, int, int]] = []
     for first, second in combinations(range(len(views)), 2):
@@ -230,14 +209,14 @@ def _registered_pairs(
         enough = min(partners[first], partners[second]) >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
-        pair = _register(views, first, second, geometry, force, seed)
+        pair = _register(views, first, second, geometry, seed)
         for _ in range(MAX_FURTHER_TRIALS):
             if pair is not None or geometry.matrix is None:
                 break
             # Most matches on repeated structure may be wrong, so the others are tried alone.
             tentative = tentative.apart_from(geometry.matrix)
             geometry = estimate_initial_geometry(tentative, "homography", seed)
-            pair = _register(views, first, second, geometry, force, seed)
+            pair = _register(views, first, second, geometry, seed)
         if pair is not None:
             pairs.append(pair)
             partners[first] += 1
@@ -246,25 +225,15 @@ def _registered_pairs(
 
 
 def _register(
-    views: Sequence[_Image],
-    first: int,
-    second: int,
-    geometry: InitialGeometry,
-    force: bool,
-    seed: int,
+    views: Sequence[_Image], first: int, second: int, geometry: InitialGeometry, seed: int
 ) -> RegisteredPair | None:
-    """Register a pair by dense matches guided by a geometry; return None if they reject it.
-
-    Also return None if the aligned images reject it, unless `force`.
-    """
+    """Register a pair by dense matches guided by a geometry; return None if they reject it."""
     if geometry.matrix is None:
         return None
     a, b = views[first], views[second]
     keypoints = a.keypoints, b.keypoints
     guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
     if guide.matrix is None or matches is None:
-        return None
-    if not force and not agree(a.gray, b.gray, guide.matrix):
         return None
     points = matches.starts(a.keypoints)
     order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
@@ -276,7 +245,6 @@ def _registered_again(
     views: Sequence[_Image],
     to_common: dict[int, np.ndarray],
     pairs: Sequence[RegisteredPair],
-    force: bool,
     seed: int,
 ) -> list[RegisteredPair]:
     """Register pairs again, starting from the joint fit, if they disagree with it or are missing.
@@ -317,7 +285,7 @@ def _registered_again(
                 points1=nowhere,
                 others=None,
             )
-            again = _register(views, first, second, geometry, force, seed)
+            again = _register(views, first, second, geometry, seed)
             if again is not None:
                 partners[first].add(second)
                 partners[second].add(first)
