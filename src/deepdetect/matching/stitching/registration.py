@@ -54,8 +54,8 @@ MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
-"""A pair contradicts the joint fit if its RMS distance from it exceeds this inlier threshold of a
-homography: a typical match is then an outlier. The distance is 0.2 to 1 px if nothing is wrong."""
+"""Images contradict each other if the RMS residual of their joint fit exceeds the inlier threshold
+of a homography: a typical match is then an outlier. It is 0.2 to 1 px if nothing is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ def register_images(
         raise RegistrationError(f"the images contradict each other: {hint}") from None
     worst = max(pairs, key=lambda pair: _disagreement_px(pair, to_common))
     off_px = _disagreement_px(worst, to_common)
-    for pair in [worst] if off_px > MAX_RESIDUAL_PX else unlike[: int(force)]:
+    for pair in [worst] if residual_px > MAX_RESIDUAL_PX else unlike[: int(force)]:
         reason = (
             f"images[{pair.first}] and images[{pair.second}] contradict each other where they "
             f"overlap ({off_px:.1f} px in the panorama): leave one of them out, or {hint}"
