@@ -31,7 +31,7 @@ def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Pat
     files = [str(tmp_path / f"{name}.png") for name in "abc"]
     words = ["stitch", *files, "-o", str(tmp_path / "p.png"), "--reference", files[2]]
     result = run_command([*words, "--json"])
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 1, result.output
     report = json.loads(result.stdout)
     assert [each["image"] for each in report["unregistered"]] == [files[1]]
     assert report["images"] == [files[0], files[2]]
@@ -121,3 +121,29 @@ def test_too_few_that_can_be_read(bad: str, files: list[Path]) -> None:
     assert result.exit_code == 2, result.output
     assert "bad.png" in result.stderr.splitlines()[-1]
     assert not Path("p.png").exists()
+
+
+@pytest.fixture
+def screens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Photographs of different things under the same header and over the same footer."""
+    data = pytest.importorskip("skimage.data")
+    monkeypatch.chdir(tmp_path)
+    frame = data.page()[:120, :360].repeat(3).reshape(120, 360, 3)
+    pages = data.astronaut(), data.coffee(), data.chelsea()
+    for k, page in enumerate(pages):
+        content = page[:260, :360]
+        Image.fromarray(np.concatenate([frame[:60], content, frame[60:]])).save(f"{k}.png")
+    return [f"{k}.png" for k in range(len(pages))]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_images_that_contradict_each_other_are_written_by_force_only(screens: list[str]) -> None:
+    refused(*screens, "-o", "page.png", code=3)
+    assert not Path("page.png").exists()
+    result = run_command(["stitch", *screens, "-o", "page.png", "--force", "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["images"] == screens
+    assert "contradict" in result.stderr
+    assert screens[0] in result.stderr
+    assert Path("page.png").exists()

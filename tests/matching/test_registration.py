@@ -126,3 +126,76 @@ def test_a_union_is_limited_by_pixels_however_many_channels(shape: tuple[int, ..
     assert MAX_UNION * 20_000 < 299**2
     with pytest.raises(RegistrationError):
         _union(shape, shape, np.diag([1 / 3, 1 / 3, 1]))
+
+
+FIELDS = ("Surname", "Date of birth", "Street 12", "Town", "Account no.", "Signed")
+
+
+def drawing(kind: str) -> np.ndarray:
+    """A drawing with large flat parts, (480, 480) uint8."""
+    page = np.full((480, 480), 255, np.uint8)
+    if kind == "board":
+        cv2.line(page, (120, 240), (480, 240), 0, 24)
+        cv2.line(page, (120, 240), (100, 300), 0, 20)
+        cv2.circle(page, (100, 300), 28, 0, -1)
+        cv2.circle(page, (100, 300), 9, 255, -1)
+        cv2.rectangle(page, (220, 0), (480, 40), 0, -1)
+        cv2.circle(page, (290, 10), 22, 255, -1)
+        cv2.rectangle(page, (340, 330), (370, 362), 0, -1)
+    elif kind == "form":
+        for row, word in zip((70, 125, 200, 262, 350, 401), FIELDS, strict=True):
+            cv2.line(page, (40, row), (440, row), 0, 2)
+            cv2.putText(page, word, (50, row - 12), 0, 0.6, 0, 2)
+        cv2.rectangle(page, (40, 20), (440, 440), 0, 2)
+    else:
+        page[:] = 230
+        coast = [[0, 200], [90, 170], [160, 260], [260, 230], [330, 330], [479, 300], [479, 479]]
+        cv2.fillPoly(page, [np.array([*coast, [0, 479]])], 120)
+        cv2.polylines(
+            page, [np.array([[60, 479], [140, 330], [250, 300], [300, 479]])], False, 40, 3
+        )
+        for x, y in ((100, 300), (210, 400), (390, 390)):
+            cv2.circle(page, (x, y), 7, 0, -1)
+    return page
+
+
+@pytest.mark.parametrize("kind", ["board", "form", "map"])
+def test_flat_drawings_are_judged_by_their_structure(kind: str) -> None:
+    page = drawing(kind)
+    moved = np.array([[1, 0, 3.4], [0, 1, -2.6], [0, 0, 1.0]])
+    shot = cv2.warpPerspective(page, moved, (480, 480), borderMode=cv2.BORDER_REPLICATE)
+    shot[250:256, 200:206] = 128  # a defect
+    found = register(page, shot)
+    assert corner_error(found.homography, moved, (480, 480)) < 1.5
+    assert not agree(page, shot, moved @ np.array([[1, 0, 30], [0, 1, 17], [0, 0, 1.0]]))
+
+
+def test_a_negative_agrees_with_its_print(photo: np.ndarray, second: np.ndarray) -> None:
+    assert agree(luma(photo), 255 - luma(second), WARP)
+
+
+def layers(photo: np.ndarray, step_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two views of vertical strips in front of each other: each moves farther than the last."""
+    first = cv2.resize(photo, (512, 512))
+    second = first.copy()
+    for k in range(8):
+        strip = slice(64 * k, 64 * k + 64)
+        second[:, strip] = np.roll(first, step_px * k, axis=1)[:, strip]
+    return luma(first), luma(second)
+
+
+def test_parallax_is_no_registration(photo: np.ndarray) -> None:
+    """One homography aligns one strip of eight."""
+    assert agree(*layers(photo, 0), np.eye(3))
+    assert not agree(*layers(photo, 12), np.eye(3))
+
+
+@pytest.mark.parametrize("extent", ["reference", "union"])
+def test_a_street_is_refused_whatever_the_frame(shared: Path, extent: str, tmp_path: Path) -> None:
+    pair = [str(shared / "data" / "kitti-clip" / f"{k:06d}.jpg") for k in (0, 6)]
+    if not Path(pair[0]).is_file():
+        pytest.skip("needs the KITTI clip in ../shared")
+    result = run_command(["register", *pair, "--extent", extent, "-o", str(tmp_path / "out")])
+    assert result.exit_code == 3
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -55,7 +57,7 @@ GEOMETRY = cli.From(
     more="inlier_threshold confidence iterations",
 )
 REGISTRATION = cli.From(register_images, "extent", more="mutual seed")
-PANORAMA = cli.From(stitch_images, "projection crop", more="seed")
+PANORAMA = cli.From(stitch_images, "projection crop force", more="seed")
 OPTIONS = cli.From(StitchingOptions)
 STITCH_KEYPOINTS = cli.From(PointDetector, more="max_keypoints")
 
@@ -352,7 +354,8 @@ def stitch(
     """Stitch overlapping images, taken from one place or showing one plane, to a panorama.
 
     The images may be in any order. Images that overlap no other, or cannot be read, are left out
-    and listed. Flat panoramas cover at most 100 to 120 degrees, cylindrical or spherical ones 360.
+    and listed, with exit code 1; if images contradict each other, nothing is written, with code 3.
+    Flat panoramas cover at most 100 to 120 degrees, cylindrical or spherical ones 360.
 
         deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
         deepdetect stitch photos/ --projection cylindrical --crop -o panorama.jpg
@@ -388,9 +391,16 @@ def stitch(
         what = "too few images can be read, or the reference cannot"
         raise ImageError(f"there is no panorama, because {what}: {'; '.join(failures)}")
     cli.check_outputs([file], paths)
+
+    def named(text: object) -> str:  # has indices in place of names
+        return re.sub(r"images\[(\d+)\]", lambda found: str(images[int(found[1])]), str(text))
+
     with cli.writing({"file": file}, images, overwrite) as made:
         try:
-            with stage_progress("stitching", stages_of(len(images))) as done:
+            with (
+                stage_progress("stitching", stages_of(len(images))) as done,
+                warnings.catch_warnings(record=True, action="always") as caught,
+            ):
                 panorama = stitch_images(
                     images,
                     detector=chosen,
@@ -399,11 +409,10 @@ def stitch(
                     progress=done,
                     **values,
                 )
-        except (OptionError, RegistrationError) as error:  # has indices in place of names
-            text = str(error)
-            for number, path in enumerate(images):
-                text = text.replace(f"images[{number}]", str(path))
-            raise type(error)(text) from error
+        except (OptionError, RegistrationError) as error:
+            raise type(error)(named(error)) from error
+        for warning in caught:
+            warnings.warn(named(warning.message), warning.category, stacklevel=2)
         moved = panorama.homographies[panorama.reference] if flat else None
         kept, image = carried[panorama.reference].moved(moved), panorama.image
         if kept.no_data is not None and kept.no_data in range(np.iinfo(image.dtype).max + 1):
@@ -413,7 +422,7 @@ def stitch(
         save_picture(image, made["file"], kept)
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
-        cli.say(f"{images[number]} is not in the panorama: {reason}")
+        failures.append(f"{images[number]} is not in the panorama: {reason}")
     if panorama.parallax:
         (first, second), distance = max(panorama.parallax.items(), key=lambda item: item[1])
         cli.say(

@@ -35,7 +35,15 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     flat = cv2.inRange(rgb, colour - MAX_FRAME_NOISE, colour + MAX_FRAME_NOISE)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    parts = [k for k in border if k and stats[k, cv2.CC_STAT_AREA] >= MIN_FRAME_SHARE * flat.size]
+    areas = stats[:, cv2.CC_STAT_AREA]
+    parts = [k for k in border if k and areas[k] >= MIN_FRAME_SHARE * flat.size]
+    near = MAX_FRAME_NOISE // 4
+    close = np.bincount(
+        labels[cv2.inRange(rgb, colour - near, colour + near) > 0], minlength=len(areas)
+    )
+    # Most of a frame is much closer to its colour than JPEG may leave it, unlike textured blobs.
+    if 2 * close[parts].sum() < areas[parts].sum():
+        return nowhere
     scene = cv2.morphologyEx(
         (~np.isin(labels, parts)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))
     )

@@ -118,12 +118,13 @@ def local_zncc(
     valid_mask: np.ndarray,
     window_px: int = WINDOW_PX,
     step_px: int = 1,
+    min_variance: float = MIN_VARIANCE,
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation (ZNCC) of windows at the same positions.
 
     A window of side `window_px`, an odd multiple of `step_px`, is centred on each square of
     `step_px` pixels. Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for windows that
-    are flat or partly outside `valid_mask`.
+    are flat (up to `min_variance`) or partly outside `valid_mask`.
     """
     side = window_px // step_px
     shape = (first.shape[0] // step_px, first.shape[1] // step_px)
@@ -146,7 +147,7 @@ def local_zncc(
     variance_a = mean(a * a) - mean_a**2
     variance_b = mean(b * b) - mean_b**2
     inside = _erode(at_steps(mask.astype(np.float32)) > 1 - 0.5 / step_px**2, side)
-    known = inside & (variance_a > MIN_VARIANCE) & (variance_b > MIN_VARIANCE)
+    known = inside & (variance_a > min_variance) & (variance_b > min_variance)
     covariance = mean(a * b) - mean_a * mean_b
     result = np.full(shape, np.nan, np.float32)
     scale = np.sqrt(variance_a[known] * variance_b[known])

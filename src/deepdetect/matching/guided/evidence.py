@@ -122,10 +122,10 @@ def is_repeated(
     x, y = np.rint(scaled_points(points0, scale0)).clip(0, last).astype(np.int64).T
     places = np.zeros(first.shape, bool)
     places[y, x] = True
-    own = warped_zncc(first, second, matrix)[places]
+    own = warped_zncc(first, second, matrix)
     for shift in _similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
         other = refine_homography(first, second, matrix @ translation_matrix(*shift))
-        others = warped_zncc(first, second, other)[places]
+        others = warped_zncc(first, second, other)
         step = np.linalg.inv(matrix) @ other
         middle = np.array([last / 2])
         if transfer_errors(middle, middle, step)[0] < MIN_SHIFT_PX:
@@ -133,25 +133,33 @@ def is_repeated(
         # Content that recurs one shift away in the first image is no evidence for the homography:
         # where the pattern ends, its next period may just be hidden.
         recurring = [warped_zncc(first, first, move) for move in (step, np.linalg.inv(step))]
-        recurs = np.fmax(*recurring)[places] > MIN_ZNCC
-        explained = np.fmax(own, others) > MIN_ZNCC  # False where both are NaN
-        known = explained & np.isfinite(own) & np.isfinite(others)
-        gain = (own - others)[known]
-        alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
-        other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
-        least = max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone)
-        if len(gain) < MIN_COMPARED:
-            # With so few places, the distinctive descriptors of sparse matches suffice if enough of
-            # their patches look alike and the copy alone explains no place.
-            alike = np.mean(own > MIN_ZNCC) > MIN_EXPLAINED_FRACTION
-            least = 0 if distinct and alike and not other_alone else np.inf
-        if alone < least:
+        recurs = np.fmax(*recurring) > MIN_ZNCC
+        # Matches along one edge fit any shift along it, but the rest of the images may decide.
+        if not (
+            _preferred(own[places], others[places], recurs[places], distinct)
+            or _preferred(own.ravel(), others.ravel(), recurs.ravel(), distinct=False)
+        ):
             copy = scaled_homography(other, 1 / scale0, 1 / scale1)
             if sparse is None or not _parallax_decides(
                 first, scale0, sparse, homography, copy, seed
             ):
                 return True
     return False
+
+
+def _preferred(own: np.ndarray, others: np.ndarray, recurs: np.ndarray, distinct: bool) -> bool:
+    """Return whether (N,) ZNCCs at places prefer a homography (`own`) to its copy (`others`)."""
+    explained = np.fmax(own, others) > MIN_ZNCC  # False where both are NaN
+    known = explained & np.isfinite(own) & np.isfinite(others)
+    gain = (own - others)[known]
+    alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
+    other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
+    if len(gain) < MIN_COMPARED:
+        # With so few places, the distinctive descriptors of sparse matches suffice if enough of
+        # their patches look alike and the copy alone explains no place.
+        alike = np.mean(own > MIN_ZNCC) > MIN_EXPLAINED_FRACTION
+        return bool(distinct and alike and not other_alone)
+    return bool(alone >= max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone))
 
 
 def _parallax_decides(

@@ -17,7 +17,7 @@ from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches, TwoViewGeometry
 from ...geometry.estimation import TwoViewModel, estimate_geometry, measure_parallax
 from ...geometry.homography_refinement import most_alike, refine_homography
-from ...geometry.images import downscale, edge_strength, warp_to_reference
+from ...geometry.images import downscale, edge_strength, median_local_zncc, warp_to_reference
 from ...geometry.transforms import (
     epipolar_errors,
     scaled_homography,
@@ -209,10 +209,12 @@ def _plane_or_depth(
     plane = _trusted(first, matrix, on_plane, enough)
     evidence = replace(plane[0].evidence, verified=verified)
     plane = replace(plane[0], evidence=evidence), plane[1]
-    if first.cross_modal:
-        # In images of two sensors, patches that differ are no evidence of depth.
-        if plane[1] is None:
+    if first.cross_modal or first.parallax is None:
+        # Patches differ in images of two sensors, and unrelated ones are equal in line drawings.
+        if plane[1] is None and first.cross_modal:
             plane = _sparsely(grays[0], pixels[0], first)
+        elif plane[1] is None and median_local_zncc(*grays, matrix) > MIN_CLEAR_CORRELATION:
+            plane = _sparsely(grays[0], pixels[0], replace(first, matrix=matrix))
         if plane[1] is not None:
             return plane
     clear = first.parallax is not None and first.parallax.log10_nfa < MAX_PARALLAX_LOG10_NFA

@@ -9,18 +9,17 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ..._shared.alpha import continued
-from ..._shared.errors import OptionError, RegistrationError, check_name
+from ..._shared.errors import OptionError, check_name
 from ..._shared.image_array import Channels, from_16_bits, to_8_bits
 from ..._shared.options import check_ranges, suggest_keywords, whole
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
-from ...io.image import load_pixels, luma, one_range
+from ...io.image import load_pixels, one_range
 from ...io.image_file import read_with
 from ...io.projection import require_pinhole
 from ..guided.tentative_matches import MAX_SIDE_PX
-from ..overlay import find_overlay
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .canvas import Canvas, least_distorted, plan_curved, plan_plane
 from .compositing import composite, crop_box
@@ -117,6 +116,7 @@ def stitch(
     projection: Projection = "plane",
     crop: bool = False,
     reference: int | None = None,
+    force: bool = False,
     seed: int = 0,
     options: StitchingOptions = StitchingOptions(),
     progress: Callable[[str], object] | None = None,
@@ -140,6 +140,7 @@ def stitch(
         crop: crop the panorama to the largest rectangle without black areas.
         reference: number of the undistorted image of a flat panorama, or of the middle image of a
             curved one; None chooses the image that distorts the others least.
+        force: make the panorama even if its pairs contradict each other; a warning then says so.
         seed: seed of all random choices.
         options: scale, size limit and registration size of the panorama.
         progress: called with the name of each stage (`stages_of`) when it ends.
@@ -152,7 +153,7 @@ def stitch(
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
         RegistrationError: no two images overlap, an image is too oblique to the reference for a
-            flat panorama, or the cameras of a curved panorama did not only rotate.
+            flat panorama, or the images contradict each other.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -175,30 +176,17 @@ def stitch(
                 f"`reference` must be an image number, 0 to {len(images) - 1}, not {reference}"
             )
     timer = StageTimer(progress)
-    small: dict[int, tuple[np.ndarray, float]] = {}
-    sizes: dict[int, tuple[int, int]] = {}
     with one_range(images, channels) as reading:
         pass
-    deep = reading.deep_range is not None
     with timer.stage("reading"), read_with(reading):
-        for number, image in enumerate(images):
-            rgb = continued(load_pixels(image, channels, deep=True))
-            deep &= rgb.dtype == np.uint16
-            require_pinhole(image, to_8_bits(rgb)[:, :, :3])
-            sizes[number] = (rgb.shape[1], rgb.shape[0])
-            small[number] = downscale(to_8_bits(rgb), options.registration_side)
-        del rgb
-    if still := find_overlay([luma(rgb) for rgb, _ in small.values()], seed).mean():
-        raise RegistrationError(
-            f"{still:.1%} of all images stands still while the scene moves (a header, a caption, a "
-            "logo): crop it off"
-        )
+        small, sizes, deep = _reduced(images, channels, options.registration_side)
     with timer.stage("registration"):
         registration = register_images(
             [rgb for rgb, _ in small.values()],
             DeepDetect() if detector is None else detector,
             reference=reference,
             turning=projection != "plane",
+            force=force,
             seed=seed,
             progress=progress,
         )
@@ -213,7 +201,7 @@ def stitch(
             small,
             canvas,
         )
-        if deep and reading.deep_range:
+        if deep and reading.deep_range is not None:
             panorama = np.where(valid[..., None], from_16_bits(panorama, reading.deep_range), 0)
         if crop:
             left, top, right, bottom = crop_box(valid, canvas.closed)
@@ -235,6 +223,20 @@ def stitch(
         parallax,
         canvas.closed,
     )
+
+
+def _reduced(
+    images: Sequence[Any], channels: Channels, side: int
+) -> tuple[dict[int, tuple[np.ndarray, float]], dict[int, tuple[int, int]], bool]:
+    """Return images reduced to a longer side, with scales; full sizes; whether all have 16 bits."""
+    small, sizes, deep = {}, {}, True
+    for number, image in enumerate(images):
+        rgb = continued(load_pixels(image, channels, deep=True))
+        deep &= rgb.dtype == np.uint16
+        require_pinhole(image, to_8_bits(rgb)[:, :, :3])
+        sizes[number] = (rgb.shape[1], rgb.shape[0])
+        small[number] = downscale(to_8_bits(rgb), side)
+    return small, sizes, deep
 
 
 def _plan(

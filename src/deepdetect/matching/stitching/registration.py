@@ -8,6 +8,7 @@ it but were not registered, are matched again starting from it, and the fit is r
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -22,9 +23,11 @@ from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints, detect_sift
 from ...geometry.transforms import transfer_errors, transform_points
+from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 from ...io.image import luma
 from ..guided import TentativeMatches, find_tentative_matches, guided_matches
 from ..guided.initial_geometry import InitialGeometry, estimate_initial_geometry
+from ..registration import agree
 from .bundle_adjustment import RegisteredPair, RotatingCamera, adjust_cameras, adjust_homographies
 
 SIFT_KEYPOINTS = 2000
@@ -50,8 +53,9 @@ MAX_DISAGREEMENT_PX = 2.0
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
-MAX_CAMERA_RESIDUAL_PX = 3.0
-"""Maximum RMS residual of cameras that only rotate; it is 0.2 to 1 px without parallax."""
+MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
+"""Images contradict each other if the RMS residual of their joint fit exceeds the inlier threshold
+of a homography: a typical match is then an outlier. It is 0.2 to 1 px if nothing is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +88,7 @@ def register_images(
     *,
     reference: int | None = None,
     turning: bool = False,
+    force: bool = False,
     seed: int = 0,
     progress: Callable[[str], object] | None = None,
 ) -> JointRegistration:
@@ -92,6 +97,7 @@ def register_images(
     SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
     without heat map do both. The largest group of connected images is registered, or the group that
     contains image number `reference`. If `turning`, cameras that only rotate are estimated as well.
+    If `force`, images that contradict each other give a warning, not an error.
     """
     done = progress or (lambda _: None)
     views = []
@@ -122,19 +128,27 @@ def register_images(
     }
     pairs = [pair for pair in pairs if pair.first in group]
     sizes = {number: views[number].gray.shape[::-1] for number in group}
-    homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
-    to_common = homographies
-    if cameras is not None:
-        to_common = {n: one.to_common(sizes[n]) for n, one in cameras.items()}
-    again = _registered_again(views, to_common, pairs, seed)
-    if set(again) != set(pairs):
-        pairs = again
-        homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
-    if turning and residual_px > MAX_CAMERA_RESIDUAL_PX:
-        raise RegistrationError(
-            f"the cameras of these images did not only rotate ({residual_px:.1f} px remain): "
-            "take all images from one place, or choose the projection 'plane'"
+    hint = "choose the projection 'plane'" if turning else "crop what stands still in all images"
+    try:
+        homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
+        again = _registered_again(views, to_common, pairs, seed)
+        if set(again) != set(pairs):
+            pairs = again
+            homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
+    except np.linalg.LinAlgError:
+        raise RegistrationError(f"the images contradict each other: {hint}") from None
+    worst = max(pairs, key=lambda pair: _disagreement_px(pair, to_common))
+    off_px = _disagreement_px(worst, to_common)
+    grays = [view.gray for view in views]
+    unlike = [not agree(grays[p.first], grays[p.second], p.homography) for p in pairs]
+    if residual_px > MAX_RESIDUAL_PX or np.mean(unlike) > 0.5:  # a few wrong pairs are outvoted
+        reason = (
+            f"images[{worst.first}] and images[{worst.second}] contradict each other where they "
+            f"overlap ({off_px:.1f} px in the panorama): leave one of them out, or {hint}"
         )
+        if not force:
+            raise RegistrationError(f"{reason} (or set `force`)")
+        warnings.warn(reason, UserWarning, stacklevel=3)
     counts = {(pair.first, pair.second): pair.matches for pair in pairs}
     return JointRegistration(homographies, cameras, counts, residual_px, unregistered)
 
@@ -144,13 +158,21 @@ def _adjust(
     pairs: Sequence[RegisteredPair],
     sizes: dict[int, tuple[int, int]],
     turning: bool,
-) -> tuple[dict[int, np.ndarray], dict[int, RotatingCamera] | None, float]:
-    """Fit all images of a group jointly to their pairs; also return the residual in pixels."""
+) -> tuple[dict[int, np.ndarray], dict[int, RotatingCamera] | None, dict[int, np.ndarray], float]:
+    """Fit a group jointly; return homographies, cameras, maps to the common frame, residual."""
     homographies, residual_px = adjust_homographies(_compose(group, pairs), pairs, sizes)
-    cameras = None
-    if turning:
-        cameras, residual_px = adjust_cameras(homographies, pairs, sizes)
-    return homographies, cameras, residual_px
+    if not turning:
+        return homographies, None, homographies, residual_px
+    cameras, residual_px = adjust_cameras(homographies, pairs, sizes)
+    to_common = {number: one.to_common(sizes[number]) for number, one in cameras.items()}
+    return homographies, cameras, to_common, residual_px
+
+
+def _disagreement_px(pair: RegisteredPair, to_common: dict[int, np.ndarray]) -> float:
+    """Return the RMS distance of a pair's own homography from a joint fit, at its matches."""
+    matrix = np.linalg.inv(to_common[pair.second]) @ to_common[pair.first]
+    expected = transform_points(pair.points, pair.homography)
+    return float(np.sqrt(np.mean(transfer_errors(pair.points, expected, matrix) ** 2)))
 
 
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
@@ -208,7 +230,7 @@ def _register(
     a, b = views[first], views[second]
     keypoints = a.keypoints, b.keypoints
     guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
-    if guide.matrix is None or matches is None:
+    if guide.matrix is None or matches is None or matches.points0 is not None:  # not dense
         return None
     points = a.keypoints[matches.indices0]
     order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
@@ -248,9 +270,7 @@ def _registered_again(
                 )
             )
         else:
-            expected = transform_points(pair.points, pair.homography)
-            off_px = transfer_errors(pair.points, expected, matrix)
-            good = bool(np.sqrt(np.mean(off_px**2)) < MAX_DISAGREEMENT_PX)
+            good = _disagreement_px(pair, to_common) < MAX_DISAGREEMENT_PX
         if not good:
             nowhere = np.empty((0, 2))
             geometry = InitialGeometry(
