@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .._shared.machine import one_opencv_thread
 from .._shared.opencv import cv2
 
 MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
@@ -26,12 +27,17 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     A frame has one colour, reaches the border of the image, and ends in a smooth line: letter
     boxes, corners of rotated or undistorted images, the surroundings of a round lens.
     """
-    nowhere = np.zeros(rgb.shape[:2], bool)
     ring = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     values, counts = np.unique(ring @ np.array([65536, 256, 1]), return_counts=True)
     if counts.max() < MIN_RING_SHARE * len(ring):
-        return nowhere
+        return np.zeros(rgb.shape[:2], bool)
     colour = (values[counts.argmax()] >> np.array([16, 8, 0]) & 255).astype(np.float64)
+    with one_opencv_thread():  # OpenCV would start more than OMP_NUM_THREADS allows
+        return _frame_of_colour(rgb, colour)
+
+
+def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    nowhere = np.zeros(rgb.shape[:2], bool)
     flat = cv2.inRange(rgb, colour - MAX_FRAME_NOISE, colour + MAX_FRAME_NOISE)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))

@@ -108,6 +108,7 @@ def match_images(
         source = checked_positions(source)
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
+    masks: Sequence[np.ndarray | None]
     rgb, masks = load_pair((image0, image1), channels, ignore)
     if model != "homography":
         _require_pinholes((image0, image1), rgb, rim=False)
