@@ -130,6 +130,11 @@ def _contradicted(still: np.ndarray, pair: Pair, seed: int) -> np.ndarray:
         pair[0], MAX_CORNERS, MIN_QUALITY, STILL_WINDOW_PX, mask=np.uint8(round_)
     )
     standing = np.empty((0, 2)) if corners is None else corners[:, 0].astype(np.float64)
+    regions = np.bincount(
+        labels[tuple(np.rint(standing.T[::-1]).astype(int))], minlength=labels.max() + 1
+    )
+    if regions[1:].max(initial=0) < MIN_STILL_CORNERS:  # before the matching, which takes longest
+        return np.zeros(still.shape, bool)
     tentative, size = find_tentative_matches(*pair), still.shape[::-1]
     motion = np.linalg.norm(tentative.points1 - tentative.points0, axis=1)
     moves = motion > MAX_STILL_PX
