@@ -215,7 +215,7 @@ def test_there_is_memory_but_not_endlessly() -> None:
 def test_memory_of_a_container_that_caches_files_is_free(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a control group of 8 GB, 6 GB used, of which 3 GB are files that can be dropped."""
+    """A control group may use 8 GB and uses 6 GB, of which 3 GB are files that can be dropped."""
     monkeypatch.setattr(machine, "Path", lambda _: tmp_path)
     monkeypatch.setattr(machine, "_system_memory", lambda: 2**45)
     without = available_memory()

@@ -25,7 +25,7 @@ NEAR_PX = 1e-3
 """From a point of Python at which one of the page is the same: positions are float32 here."""
 
 SHARED = 0.998
-"""Of the points, at least: rounded, two are nearer or farther than their radius."""
+"""At least this fraction of the points is the same. Rounding moves two across their radius."""
 
 SCORE = 1e-6
 """Largest difference of their scores."""

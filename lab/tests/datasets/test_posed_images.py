@@ -1,4 +1,4 @@
-"""The same two cameras, written in three layouts with the conventions of each."""
+"""The tests write two cameras in three layouts, with the conventions of each."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def same(found: Iterable[Batch], expected: Iterable[Batch]) -> None:
 
 
 def again(source: FolderSource, memory_bytes: int = 0) -> FolderSource:
-    """The same images and labels, with nothing in memory."""
+    """A source reads the same images and labels, but keeps nothing in memory."""
     folder = source.label_folder.parent
     return FolderSource(source.images, folder, OPTIONS.labels, memory_bytes)
 

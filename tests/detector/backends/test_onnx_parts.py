@@ -38,7 +38,7 @@ def test_tensors_that_are_missing(inputs: list[str], outputs: list[str]) -> None
 
 
 def test_the_package_computes_logits_only(tmp_path: Path) -> None:
-    """Of a file that gives points, too: these would take time."""
+    """The points that a file also gives are not computed, because they would take time."""
     onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
     from deepdetect.detector.backends.interface import RuntimeOptions
     from deepdetect.detector.backends.onnxruntime_backend import open_onnxruntime

@@ -22,7 +22,8 @@ NEAR_PX = 0.05
 """From a point of Python at which one of a file is the same. Its size is the same, too."""
 
 LEAST_SHARE = 0.97
-"""Of the points of a photograph. Where it is nearly even, rounding decides where maxima are."""
+"""At least this fraction of a photograph's points is the same. In nearly uniform areas, rounding
+decides where the maxima are."""
 
 SIZES = [(16, 17), (101, 99), (20, 250), (200, 256)]
 """Heights and widths: smaller than the largest Gaussian, with fewer points than the file gives."""
