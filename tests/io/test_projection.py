@@ -85,8 +85,15 @@ def test_a_photograph_of_2_to_1_is_no_panorama(seed: int) -> None:
     assert not edges_meet(pinhole(seed))
 
 
-def test_only_images_of_exactly_2_to_1_are_looked_at() -> None:
-    assert not edges_meet(panorama()[:-2])
+def test_a_panorama_may_be_resized_or_a_cylinder_but_is_wide() -> None:
+    made = panorama()
+    for size in [(513, 256), (512, 257), (1030, 511)]:
+        assert edges_meet(cv2.resize(made, size, interpolation=cv2.INTER_AREA))
+    cylinder = made[60:-60]
+    with pytest.raises(ImageError, match="photographs"):
+        load_pinhole(encoded(cylinder))
+    assert not edges_meet(cylinder[:, :-40])
+    assert not edges_meet(made[:, 100:-100])
 
 
 def test_what_repeats_or_is_plain_is_no_panorama() -> None:
@@ -109,6 +116,33 @@ def test_a_circular_fisheye_is_round(side: int, size: tuple[int, int], degrees: 
     with pytest.raises(ImageError, match="v360=fisheye"):
         load_pinhole(encoded(made), rim=True)
     np.testing.assert_array_equal(load_pinhole(made)[..., 0], made)
+
+
+@pytest.mark.parametrize("ground", [0, 30])
+@pytest.mark.parametrize("diameter", [280, 330, 420])
+def test_a_circle_may_be_cut_and_on_a_dark_ground(diameter: int, ground: int) -> None:
+    made = fisheye(diameter, 170, (426, 240))
+    made = np.where(made > 3, made.clip(ground + 20), ground).astype(np.uint8)
+    assert is_round(made)
+    assert not is_round(made[:, 115:-115])  # cut on all sides: a lens hood looks the same
+
+
+@pytest.mark.parametrize("size", [(240, 240), (320, 240), (213, 240)])
+def test_two_fisheye_pictures_side_by_side(size: tuple[int, int]) -> None:
+    one = fisheye(min(size) - 4, 170, size)
+    with pytest.raises(ImageError, match="dfisheye"):
+        load_pinhole(encoded(np.hstack([one, one])), rim=True)
+    load_pinhole(encoded(np.hstack([one, pinhole(1, size)])), rim=True)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_cross_of_six_squares_is_a_cube_map(turned: bool) -> None:
+    cross = pinhole(0, (256, 192))
+    cross[:64, [*range(64), *range(128, 256)]] = 0
+    load_pinhole(encoded(cross))
+    cross[128:, [*range(64), *range(128, 256)]] = 0
+    with pytest.raises(ImageError, match="faces"):
+        load_pinhole(encoded(cross.T if turned else cross))
 
 
 def test_other_pictures_on_black_are_not_round() -> None:

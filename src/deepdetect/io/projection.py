@@ -13,51 +13,64 @@ from .._shared.opencv import cv2
 from .image import luma
 from .image_file import RAW_SUFFIXES, file_name, is_file, is_path, open_image
 
-ROWS, SHARPEST, FAR = 512, 0.003, (1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2)
-"""Edges meet if they differ less than any two columns at the distances FAR (of the width), and no
-more than neighbours without the SHARPEST part, which are outlines of things. A plain background is
-mostly wider than 1/16, so that far columns are alike. Some ROWS are compared, because more
-take time."""
+MIN_ASPECT, MAX_ASPECT = 1.95, 2.05
+"""A panorama of 360 degrees is at least MIN_ASPECT times as wide as high. Up to MAX_ASPECT it is a
+sphere (2, up to resizing), otherwise it may be a cylinder."""
 
-SIDE_PX, BLACK, ROUNDNESS = 128, 16, 0.97
-"""An image is reduced to the shorter side SIDE_PX. If it is round, grey levels outside are up to
-BLACK (ITU-R BT.601), it fills at least this part of a circle (an octagon fills 0.90), and its
-diameter is the shorter side, to twice what is missing at 1. The last was chosen by hand."""
+ROWS, SHARPEST, FAR, MARGIN = 512, 0.003, (1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2), 1.4
+"""Edges meet if they differ MARGIN times less than any two columns at the distances FAR (of the
+width), and no more than neighbours without the SHARPEST part, which are outlines of things. A plain
+background is mostly wider than 1/16, so that far columns are alike. Some ROWS are compared, which
+takes less time. The ratio is at least 1.5 for 6 panoramas, and at most 1.4 for 2,163 photographs
+cut to 2:1."""
 
-CUT = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90:yaw=0 view.png"
-PANORAMA, FISHEYE = "e:flat", "fisheye:flat:ih_fov=180:iv_fov=180"
+SIDE_PX, BLACK, MAX_DARK, ROUNDNESS, MAX_CUT = 128, 16, 48, (0.97, 0.92), 16 / 9
+"""An image is reduced to the shorter side SIDE_PX. If it is round, its corners have up to MAX_DARK
+grey levels (the noise of cheap cameras), it is brighter by over BLACK (ITU-R BT.601), and fills the
+first part ROUNDNESS of a circle (an octagon fills 0.90), or the second if two are side by side. The
+diameter is from the shorter side to MAX_CUT times that (a video of full width). Chosen by hand."""
+
+VIEWS = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90 view.png"
+PHOTOGRAPHS = "give the photographs it is made of"
 
 
-def require_pinhole(image: Any, rgb: np.ndarray | None, *, rim: bool = True) -> None:
+def require_pinhole(
+    image: Any, rgb: np.ndarray | None, *, rim: bool = True, name: str = "the image"
+) -> None:
     """Raise an ImageError if an image is a panorama or a fisheye picture.
 
     `rgb` (H, W, 3) are its pixels; without them, only its metadata count. With `rim`, a round
-    picture on black is that of a fisheye. A plane seen through an eyepiece looks the same.
+    picture on black is that of a fisheye. A plane seen through an eyepiece looks the same. An image
+    that is no file has the `name` in the message.
     """
-    tags, projection, full = _metadata(image)
+    tags, projection, size = _metadata(image)
     lens = f"{tags.get(Base.LensMake, '')} {tags.get(Base.LensModel, '')}"
     gray = np.zeros((1, 1), np.uint8) if rgb is None else luma(rgb)
-    how = CUT.format(file_name(image) if is_path(image) else "IMAGE", PANORAMA)
-    iphone = tags.get(Base.CustomRendered) == 6  # for panoramas; the standard has only 0 and 1
-    if iphone or (projection and not full):
-        what, how = "part of a panorama by its metadata", "give the photographs it is made of"
+    width, height = size or gray.shape[::-1]
+    sphere = MIN_ASPECT * height <= width <= MAX_ASPECT * height
+    form, how = "e:flat", VIEWS
+    if tags.get(Base.CustomRendered) == 6 or (projection and not sphere):  # 6: iPhones' panoramas
+        what, how = "part of a panorama by its metadata", PHOTOGRAPHS
     elif projection or edges_meet(gray):
-        what = f"a full panorama ({'by its metadata' if projection else '2:1, and its edges meet'})"
+        what = f"a full panorama ({'by its metadata' if projection else 'its edges meet'})"
+        how = VIEWS if sphere else PHOTOGRAPHS
+    elif is_cube_map(gray):
+        what, how = "a cube map", "give its six faces"
     elif "fisheye" in re.sub(r"[\W_]", "", lens.lower()) or (rim and is_round(gray)):
-        what, how = "a fisheye picture (round, or by its EXIF)", how.replace(PANORAMA, FISHEYE)
+        what = "a fisheye picture (round, or by its EXIF)"
+        form = "fisheye:flat:ih_fov=180:iv_fov=180"
+    elif rim and all(is_round(half, 1) for half in np.array_split(gray, 2, axis=1)):
+        what, form = "two fisheye pictures side by side", "dfisheye:flat"
     else:
         return
-    raise ImageError(f"{file_name(image)} is {what}, which no pinhole geometry fits: {how}")
+    name, file = (file_name(image),) * 2 if is_path(image) else (name, "IMAGE")
+    raise ImageError(f"{name} is {what}, which no pinhole geometry fits: {how.format(file, form)}")
 
 
 def edges_meet(gray: np.ndarray) -> bool:
-    """Return whether an (H, W) image is a full equirectangular panorama by its edges.
-
-    It is twice as wide as high, and continues from its right edge to the left one, and over each
-    pole, which is an edge, to the meridian at half a turn.
-    """
+    """Return whether an (H, W) image is wide and continues from its right edge to the left one."""
     height, width = gray.shape
-    if width != 2 * height or not gray.any():
+    if width < MIN_ASPECT * height or not gray.any():
         return False
     values = gray[:: max(1, height // ROWS)].astype(np.float32)
     contrast = np.maximum(np.abs(values - values.mean(axis=0)).mean(axis=0), 1e-6)
@@ -67,39 +80,52 @@ def edges_meet(gray: np.ndarray) -> bool:
         return np.asarray(differences / np.minimum(contrast[lag:], contrast[:-lag]))
 
     far = min(unlike(int(width * part)).min() for part in FAR)
-    if not far > unlike(width - 1)[0] <= np.quantile(unlike(1), 1 - SHARPEST):
-        return False
-    depth = 2 + int(height * FAR[0])
-    for rows in (gray[:depth].astype(np.float32), gray[: -depth - 1 : -1].astype(np.float32)):
-        steps = np.abs(rows[2:] - rows[:-2]).mean(axis=1)
-        if np.abs(rows[0] - np.roll(rows[0], height)).mean() > steps.max():
-            return False
-    return True
+    seam = unlike(width - 1)[0]
+    return bool(MARGIN * seam < far and seam <= np.quantile(unlike(1), 1 - SHARPEST))
 
 
-def is_round(gray: np.ndarray) -> bool:
-    """Return whether an (H, W) image is black outside a circle that just fits into it."""
-    if gray[[0, 0, -1, -1], [0, -1, 0, -1]].max() > BLACK:
+def is_cube_map(gray: np.ndarray) -> bool:
+    """Return whether an (H, W) image is a cross of six squares on a plain ground."""
+    if len(gray) > gray.shape[1]:
+        gray = gray.T
+    side = len(gray) // 3
+    if not side or gray.shape != (3 * side, 4 * side):
         return False
+    cells = gray.reshape(3, side, 4, side)
+    plain = np.ptp(cells, axis=(1, 3)) <= BLACK
+    return bool(not plain[1].any() and (plain[0] == plain[2]).all() and plain[0].sum() == 3)
+
+
+def is_round(gray: np.ndarray, beside: int = 0) -> bool:
+    """Return whether an (H, W) image is dark outside a circle, which two edges may cut.
+
+    With `beside` 1, there is another circle beside it, which may reach into the image.
+    """
     scale = SIDE_PX / min(gray.shape)
     small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    if small.max() <= BLACK:
+    dark = int(small[[0, 0, -1, -1], [0, -1, 0, -1]].max())
+    bright = np.argwhere(small > dark + BLACK)[:, ::-1].astype(np.int32)
+    if dark > MAX_DARK or not len(bright):
         return False
-    hull = cv2.convexHull(np.argwhere(small > BLACK).astype(np.int32))
-    radius = cv2.minEnclosingCircle(hull)[1]
-    fits = abs(2 * radius / SIDE_PX - 1) <= 2 * (1 - ROUNDNESS)
-    return bool(fits and cv2.contourArea(hull) >= ROUNDNESS * np.pi * radius**2)
+    hull = cv2.convexHull(bright)
+    (x, y), radius = cv2.minEnclosingCircle(hull)
+    rows, columns = np.indices(small.shape)
+    disc = np.hypot(columns - x, rows - y) <= radius
+    filled = cv2.fillConvexPoly(np.zeros(small.shape, np.uint8), hull, 1)
+    spare = 2 * (1 - ROUNDNESS[0])
+    least, most = (1 - spare) * SIDE_PX, (1 + spare) * min(max(small.shape), MAX_CUT * SIDE_PX)
+    return bool(least <= 2 * radius <= most and filled.sum() >= ROUNDNESS[beside] * disc.sum())
 
 
-def _metadata(image: Any) -> tuple[dict[int, Any], str, bool]:
-    """Read EXIF and the projection of a panorama, "" if there is none, and whether it is 2:1."""
+def _metadata(image: Any) -> tuple[dict[int, Any], str, tuple[int, int] | None]:
+    """Read EXIF, the projection of a panorama, "" if there is none, and the size of a file."""
     try:
         if not is_file(image) or file_name(image).lower().endswith(RAW_SUFFIXES):
-            return {}, "", False
+            return {}, "", None
         with open_image(image) as opened:
             tags, xmp = dict(opened.getexif().get_ifd(IFD.Exif)), opened.info.get("xmp") or b""
             text = xmp if isinstance(xmp, str) else xmp.decode("utf-8", "ignore")
             found = re.search(r"GPano:ProjectionType\W+(?!rectilinear)(\w+)", text)
-            return tags, found[1] if found else "", opened.width == 2 * opened.height
+            return tags, found[1] if found else "", opened.size
     except Exception:  # Pillow raises many types of errors; broken tags are ignored
-        return {}, "", False
+        return {}, "", None

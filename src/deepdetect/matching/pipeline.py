@@ -29,7 +29,7 @@ from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import Images, at_pixels, image_named, load_pair
+from ..io.image import Images, at_pixels, load_pair
 from ..io.projection import require_pinhole
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
@@ -90,8 +90,8 @@ def match_images(
         there are no matches, and `Matches.success` is False.
 
     Raises:
-        ImageError: an image cannot be read, or is a panorama or a fisheye picture, to which only
-            the model "homography" may apply.
+        ImageError: an image cannot be read, is a panorama or a fisheye picture, or both are by a
+            lens that bends lines; only the model "homography" may apply to these.
         OptionError: an option is unknown or out of its range.
 
     Example:
@@ -261,6 +261,8 @@ def _match_guided(
     with timer.stage("guided matching"):
         if first is None:
             first = guiding_geometry(grays, guiding, seed, keypoints if source is None else source)
+        if guiding != "homography":
+            first.require_straight_lines(grays)
         pixels = np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)
         guide, matched = guided_matches(grays, pixels, first, seed)
     if matched is None:
@@ -289,10 +291,9 @@ def _match_guided(
 
 
 def _require_pinholes(images: tuple[Any, Any], rgb: Points, *, rim: bool) -> None:
-    """Raise an ImageError, with its index, if one of two images is not by a pinhole camera."""
+    """Raise an ImageError if one of two images is not by a pinhole camera."""
     for number, image in enumerate(images):
-        with image_named(number):
-            require_pinhole(image, rgb[number], rim=rim)
+        require_pinhole(image, rgb[number], rim=rim, name=f"images[{number}]")
 
 
 def _unmasked(matches: Matches, masks: Sequence[np.ndarray | None]) -> Matches:

@@ -329,8 +329,8 @@ def _load_pair(
 ) -> tuple[Any, Any, tuple[np.ndarray, np.ndarray], Calibration]:
     """Load two images; return them as RGB, their masks, both as luma, and their calibration."""
     rgb, masks = load_pair(images, channels, ignore)
-    for image, pixels in zip(images, rgb, strict=True):
-        require_pinhole(image, pixels)
+    for number, image in enumerate(images):
+        require_pinhole(image, rgb[number], name=f"images[{number}]")
     grays = luma(rgb[0]), luma(rgb[1])
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     return rgb, masks, grays, _calibration(calibration, focal_px, images, sizes)

@@ -18,6 +18,7 @@ import numpy as np
 from .._shared.errors import NoDepthError
 from ..batch.pair_list import Pair
 from ..geometry.camera import PosedView, camera_spacing
+from ..geometry.lens import MIN_DEVIATIONS, UNDISTORT, deviations
 from ..geometry.similarity import Similarity
 from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
@@ -69,10 +70,9 @@ MIN_VIEWS_OF_PRINCIPAL_POINT = 8
 """Principal points are estimated only if each camera took at least this number of images.
 Otherwise, they are the middle of the image. Chosen by hand."""
 
-USUAL_DISTORTION, MIN_DEVIATIONS = 0.05, 4.0
-"""A lens is looked at if it moves the corners inwards by more than the first, a part of their
-distance: SLRs stay below it, fisheyes of 100 degrees reach 0.14. A fisheye fits it better if the
-mean cost of the points falls by the second number of standard deviations (Vuong's test)."""
+USUAL_DISTORTION = 0.05
+"""A lens is looked at if it moves the corners inwards by more than this part of their distance:
+SLRs stay below it, fisheyes of 100 degrees reach 0.14."""
 
 LENSES = {"RADIAL": (0.0, 0.0), "RADIAL_FISHEYE": (1 / 3, 2 / 15)}
 """Models of equal size, and what is added to the distortion of a pinhole: the series of tan(x)."""
@@ -324,12 +324,11 @@ def require_pinholes(model: Any) -> None:
             return
         adjust(fitted, False, ROUGH_TOLERANCE)
         costs.append({n: np.log1p(point.error**2) for n, point in fitted.points3D.items()})
-    falls = np.array([costs[0][n] - costs[1][n] for n in costs[0].keys() & costs[1].keys()])
-    if falls.mean() > MIN_DEVIATIONS * falls.std() / np.sqrt(len(falls)):
+    common = costs[0].keys() & costs[1].keys()
+    pinhole, fisheye = (np.array([each[n] for n in common]) for each in costs)
+    if deviations(pinhole, fisheye) > MIN_DEVIATIONS:
         raise NoDepthError(
-            "a fisheye took these images, and no pinhole geometry fits them: undistort them, or "
-            "cut them into pinhole views: ffmpeg -i IMAGE -vf v360=fisheye:flat:ih_fov=170:"
-            "iv_fov=170:h_fov=90:v_fov=90 view.png"
+            f"a fisheye took these images, which no pinhole geometry fits: {UNDISTORT}"
         )
 
 

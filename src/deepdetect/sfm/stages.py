@@ -44,7 +44,7 @@ from ..geometry.camera import PosedView
 from ..io.image import find_images, load_image, luma, name_images, one_range
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with
 from ..io.masks import load_mask, save_mask
-from ..io.projection import require_pinhole
+from ..io.projection import MIN_ASPECT, require_pinhole
 from ..matching.overlay import find_overlay, tell_still
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .depth_maps import MATCHED_NEIGHBOURS, depth_map, find_references, limited_view
@@ -252,7 +252,9 @@ class Stages:
             for name, path in check_images(folder).items():
                 if name in described:
                     width, height = file[name]["image_size"][()]
-                    looked = width == 2 * height or not sizes  # for a rim: until one has none
+                    looked = (
+                        width >= MIN_ASPECT * height or not sizes
+                    )  # for a rim: until one has none
                     try:
                         require_pinhole(path, load_image(path) if looked else None)
                     except ValueError as error:

@@ -14,12 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..._shared.errors import ImageError
 from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
 from ...features.learned import CROSS_MODAL
 from ...features.matches import Evidence, TwoViewGeometry
 from ...geometry.estimation import TwoViewModel
 from ...geometry.images import downscale, zncc_at_points
+from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.semi_calibrated import MATCH_SIGMA_PX, refine_fundamental
 from ...geometry.transforms import (
     epipolar_errors,
@@ -97,14 +99,16 @@ class InitialGeometry(TwoViewModel):
     """A geometry of tentative matches, in pixels of the full-size images.
 
     The model is "none" if no geometry can be trusted. `points0` and `points1` are the inliers;
-    `others` are the outliers, or None if the caller prescribed the model. `num_views` is the number
-    of simulated views. From the `source`, another model can be estimated. The geometry is `learned`
-    if it comes from learned descriptors, and `cross_modal` if it comes from images of two sensors.
+    `others` are the outliers. The model is `prescribed` if the caller did not ask for "auto".
+    `num_views` is the number of simulated views. From the `source`, another model can be estimated.
+    The geometry is `learned` if it comes from learned descriptors, and `cross_modal` if it comes
+    from images of two sensors.
     """
 
     points0: np.ndarray
     points1: np.ndarray
-    others: Pair | None
+    others: Pair
+    prescribed: bool = False
     num_views: int = 0
     source: Source = None
     learned: bool = False
@@ -116,15 +120,17 @@ class InitialGeometry(TwoViewModel):
     ) -> InitialGeometry:
         """Split matches into inliers and outliers of a model; `asked` is the caller's `model`."""
         agreeing, rest = model.inliers, ~model.inliers
-        others = (points0[rest], points1[rest]) if asked == "auto" else None
         return cls(
-            **vars(model), points0=points0[agreeing], points1=points1[agreeing], others=others
+            **vars(model),
+            points0=points0[agreeing],
+            points1=points1[agreeing],
+            others=(points0[rest], points1[rest]),
+            prescribed=asked != "auto",
         )
 
     @property
     def all_points(self) -> Pair:
         """Positions of all matches in both images, inliers first."""
-        assert self.others is not None
         points0, points1 = self.others
         return np.concatenate([self.points0, points0]), np.concatenate([self.points1, points1])
 
@@ -146,12 +152,22 @@ class InitialGeometry(TwoViewModel):
             matrix=convert(self.matrix, 1 / scale0, 1 / scale1),
             points0=scaled_points(self.points0, 1 / scale0),
             points1=scaled_points(self.points1, 1 / scale1),
-            others=self.others
-            and (
+            others=(
                 scaled_points(self.others[0], 1 / scale0),
                 scaled_points(self.others[1], 1 / scale1),
             ),
         )
+
+    def require_straight_lines(self, grays: Pair) -> None:
+        """Raise an ImageError if a lens that bends lines fits the matches better than a pinhole."""
+        points0, points1 = self.all_points
+        agreeing = np.arange(len(points0)) < len(self.points0)
+        sizes = grays[0].shape[::-1], grays[1].shape[::-1]
+        if bent := distortion(points0, points1, agreeing, sizes):
+            raise ImageError(
+                f"the lens of both images moves corners inwards by some {bent:.0%}, and no pinhole "
+                f"geometry fits: {UNDISTORT}"
+            )
 
     def as_two_view_geometry(self) -> TwoViewGeometry:
         """Return the geometry as the public type `TwoViewGeometry`."""

@@ -145,7 +145,7 @@ def guided_matches(
     if matches is None:
         return geometry, None
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
-    sparse = None if first.others is None else first.all_points
+    sparse = None if first.prescribed else first.all_points
     distinct = matches.points0 is not None
     if plane is not None and is_repeated(grays, *plane, sparse, seed, distinct):
         return replace(geometry, model="none", matrix=None, scene="none"), None
@@ -233,7 +233,7 @@ def _plane_or_depth(
         if apart is not None:
             yield apart, None
         yield joint, matrix if planar else None
-        if not planar and first.others:
+        if not planar and not first.prescribed:
             # If something moves, the matches off the plane alone may give a better matrix.
             yield guiding_geometry(grays, "fundamental", seed, first.others), None
 
@@ -266,7 +266,7 @@ def _apart_from_plane(
 
     `depth` is the geometry with the common fundamental matrix of all matches.
     """
-    if first.others is None or depth.matrix is None:
+    if first.prescribed or depth.matrix is None:
         return None
     points0, points1 = first.all_points
     by_depth = (
@@ -310,7 +310,7 @@ def _with_further_planes(
     seed: int,
 ) -> GuidedMatches:
     """Add dense matches of planes that move differently, found from unexplained sparse matches."""
-    if first.others is None or matches.points0 is not None:
+    if first.prescribed or matches.points0 is not None:
         return matches
     assert geometry.matrix is not None
     points0, points1 = first.all_points

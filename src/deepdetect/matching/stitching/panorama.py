@@ -233,7 +233,7 @@ def _reduced(
     for number, image in enumerate(images):
         rgb = continued(load_pixels(image, channels, deep=True))
         deep &= rgb.dtype == np.uint16
-        require_pinhole(image, to_8_bits(rgb)[:, :, :3])
+        require_pinhole(image, to_8_bits(rgb)[:, :, :3], name=f"images[{number}]")
         sizes[number] = (rgb.shape[1], rgb.shape[0])
         small[number] = downscale(to_8_bits(rgb), side)
     return small, sizes, deep

@@ -197,6 +197,7 @@ def _registered_pairs(
         tentative = find_tentative_matches(a.gray, b.gray, (a.features, b.features))
         geometry = estimate_initial_geometry(tentative, "homography", seed)
         if geometry.model != "none":
+            geometry.require_straight_lines((a.gray, b.gray))
             overlaps.append((geometry, tentative, first, second))
         done("overlaps")
     overlaps.sort(key=lambda overlap: -len(overlap[0].points0))
@@ -280,7 +281,8 @@ def _registered_again(
                 0.0,
                 points0=nowhere,
                 points1=nowhere,
-                others=None,
+                others=(nowhere, nowhere),
+                prescribed=True,
             )
             again = _register(views, first, second, geometry, seed)
             if again is not None:
