@@ -136,7 +136,12 @@ def match(
                     rgb0, rgb1 = map(load, pair)
                     with stage_progress("matching", stages, quiet=many) as done:
                         settings = values | {"options": geometry, "progress": done}
-                        matches = match_pair(rgb0, rgb1, chosen, selection=selection, **settings)
+                        try:
+                            matches = match_pair(
+                                rgb0, rgb1, chosen, selection=selection, **settings
+                            )
+                        except ImageError as error:
+                            raise ImageError(_named(error, pair)) from error
                     save_matches(matches, made["file"])
                     if pictures:
                         save_picture(draw_all_matches(rgb0, rgb1, matches), made["picture"])
@@ -156,6 +161,11 @@ def match(
         "pairs",
         cli.NOTHING_FOUND if nothing else 0,
     )
+
+
+def _named(text: object, images: Sequence[Path]) -> str:
+    """Replace indices of images by their names."""
+    return re.sub(r"images\[(\d+)\]", lambda found: str(images[int(found[1])]), str(text))
 
 
 def _load_of_pinhole(path: Path, rim: bool) -> np.ndarray:
@@ -392,9 +402,6 @@ def stitch(
         raise ImageError(f"there is no panorama, because {what}: {'; '.join(failures)}")
     cli.check_outputs([file], paths)
 
-    def named(text: object) -> str:  # has indices in place of names
-        return re.sub(r"images\[(\d+)\]", lambda found: str(images[int(found[1])]), str(text))
-
     with cli.writing({"file": file}, images, overwrite) as made:
         try:
             with (
@@ -410,9 +417,9 @@ def stitch(
                     **values,
                 )
         except (OptionError, RegistrationError) as error:
-            raise type(error)(named(error)) from error
+            raise type(error)(_named(error, images)) from error
         for warning in caught:
-            warnings.warn(named(warning.message), warning.category, stacklevel=2)
+            warnings.warn(_named(warning.message, images), warning.category, stacklevel=2)
         moved = panorama.homographies[panorama.reference] if flat else None
         kept, image = carried[panorama.reference].moved(moved), panorama.image
         if kept.no_data is not None and kept.no_data in range(np.iinfo(image.dtype).max + 1):

@@ -35,7 +35,7 @@ PHOTOGRAPHS = "give the photographs it is made of"
 
 
 def require_pinhole(
-    image: Any, rgb: np.ndarray | None, *, rim: bool = True, name: str = "the image"
+    image: Any, rgb: np.ndarray | None, *, rim: bool = True, name: str = "IMAGE"
 ) -> None:
     """Raise an ImageError if an image is a panorama or a fisheye picture.
 
@@ -63,8 +63,8 @@ def require_pinhole(
         what, form = "two fisheye pictures side by side", "dfisheye:flat"
     else:
         return
-    name, file = (file_name(image),) * 2 if is_path(image) else (name, "IMAGE")
-    raise ImageError(f"{name} is {what}, which no pinhole geometry fits: {how.format(file, form)}")
+    name = file_name(image) if is_path(image) else name
+    raise ImageError(f"{name} is {what}, which no pinhole geometry fits: {how.format(name, form)}")
 
 
 def edges_meet(gray: np.ndarray) -> bool:

@@ -252,9 +252,8 @@ class Stages:
             for name, path in check_images(folder).items():
                 if name in described:
                     width, height = file[name]["image_size"][()]
-                    looked = (
-                        width >= MIN_ASPECT * height or not sizes
-                    )  # for a rim: until one has none
+                    wide = width >= MIN_ASPECT * height
+                    looked = wide or not sizes  # for a rim: until one has none
                     try:
                         require_pinhole(path, load_image(path) if looked else None)
                     except ValueError as error:
