@@ -37,28 +37,19 @@ sets of 15 to 25 matches in a small region, and for the worst of these in 89 of 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Number of matches that the minimal solver of each model needs."""
 
-MIN_PARALLAX_PX = 3.0
-"""A match is off the plane if its transfer error under the homography is at least this. Chosen on
-Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
+MIN_PARALLAX_PX, MAX_EPIPOLE_DISTANCE_PX = 3.0, 1.5
+"""A match is off the plane if its transfer error under the homography is at least the first. It
+agrees with an epipole if it is closer than the second to the line from there to the position that
+the homography predicts. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
-MAX_EPIPOLE_DISTANCE_PX = 1.5
-"""A match off the plane agrees with an epipole if it is closer than this to the line from the
-epipole to the position predicted by the homography. Chosen like `MIN_PARALLAX_PX`."""
+MIN_FRACTION_OF_PLANE, MIN_FRACTION_OF_REST = 0.2, 0.5
+"""Matches show that a scene has depth if those that agree on an epipole are at least the first
+fraction of those on the plane (moved objects give fewer) and the second of the others. Chosen like
+`MIN_PARALLAX_PX`."""
 
-MIN_FRACTION_OF_PLANE = 0.2
-"""A scene has depth only if the number of matches that agree on an epipole is at least this
-fraction of the number on the plane. Moved objects give fewer. Chosen like `MIN_PARALLAX_PX`."""
-
-MIN_FRACTION_OF_REST = 0.5
-"""The matches off the plane show that a scene has depth only if at least this fraction of them
-agree on an epipole. Chosen like `MIN_PARALLAX_PX`."""
-
-MAX_MATCHES = 2000
-"""`measure_parallax` uses at most this many random matches off the plane. Chosen by hand."""
-
-SAMPLES = 1000
-"""Number of candidate epipoles. Each is the intersection of two random matches' lines, from the
-position predicted by the homography to the actual position. Chosen by hand."""
+MAX_MATCHES, SAMPLES = 2000, 1000
+"""`measure_parallax` draws at most MAX_MATCHES matches off the plane, and SAMPLES epipoles, where
+the displacements of two of them from the plane intersect. Chosen by hand."""
 
 
 @suggest_keywords
@@ -243,10 +234,9 @@ def fit_shuffled(
 ) -> np.ndarray | None:
     """Fit a (3, 3) matrix to (M, 2) matches in a random order; return None if that fails.
 
-    OpenCV always draws the same samples, and the order makes them depend on the seed. For a few of
-    these samples its MAGSAC raises an error, although the matches are ordinary: a model that its
-    local optimisation needs is empty. Then `fit` gets the matches in another order. Degenerate
-    matches, such as coinciding points, do not raise an error, but give no (3, 3) matrix.
+    OpenCV always draws the same samples, and the order makes them depend on the seed. For a few
+    samples of ordinary matches its MAGSAC raises an error, and `fit` gets another order. Degenerate
+    matches, such as coinciding points, raise none, but give no (3, 3) matrix.
     """
     random = np.random.default_rng(seed)
     for _ in range(MAX_ORDERS):
@@ -266,25 +256,18 @@ def _fit(
     """Fit a model by MAGSAC. If that fails, the result is None or a matrix of a wrong shape."""
     threshold, confidence = options.inlier_threshold, options.confidence
     iterations = int(options.iterations)
+    sought = points0, points1, cv2.USAC_MAGSAC, threshold
     if model == "homography":
-        return cv2.findHomography(
-            points0,
-            points1,
-            cv2.USAC_MAGSAC,
-            threshold,
-            maxIters=iterations,
-            confidence=confidence,
-        )[0]
+        return cv2.findHomography(*sought, maxIters=iterations, confidence=confidence)[0]
     if model == "fundamental":
-        limits = threshold, confidence, iterations
-        return cv2.findFundamentalMat(points0, points1, cv2.USAC_MAGSAC, *limits)[0]
+        return cv2.findFundamentalMat(*sought, confidence, iterations)[0]
     cameras = _cameras(options)
-    rays0, rays1 = (
+    rays = [
         np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(camera).T
         for points, camera in zip((points0, points1), cameras, strict=True)
-    )
+    ]
     focal_px = (cameras[0][0, 0] + cameras[1][0, 0]) / 2
-    return fit_essential(rays0, rays1, focal_px, threshold, confidence, iterations)
+    return fit_essential(*rays, focal_px, threshold, confidence, iterations)
 
 
 def fit_essential(
@@ -295,11 +278,10 @@ def fit_essential(
     confidence: float,
     iterations: int,
 ) -> np.ndarray | None:
-    """Fit an essential matrix by MAGSAC to (N, 3) rays (x, y, 1) in the frames of the two cameras.
+    """Fit an essential matrix by MAGSAC to (N, 3) rays (x, y, 1), with failures as in `_fit`.
 
-    If that fails, the result is None or a matrix of a wrong shape. OpenCV gets the rays as pixels
-    of a camera with the focal length `focal_px`, because its MAGSAC (in OpenCV 5) is less accurate
-    in normalised coordinates.
+    OpenCV gets the rays as pixels of a camera with the focal length `focal_px`, because its MAGSAC
+    (in OpenCV 5) is less accurate in normalised coordinates.
     """
     matrix, _ = cv2.findEssentialMat(
         np.ascontiguousarray(rays0[:, :2] * focal_px),
@@ -348,15 +330,14 @@ def log10_nfa(
 def _log10_nfa(
     count: int, agreeing: int, sample_size: int, chance: float, models_per_sample: int = 1
 ) -> float:
+    def log_binomial(count: int, chosen: int) -> float:
+        return lgamma(count + 1) - lgamma(chosen + 1) - lgamma(count - chosen + 1)
+
     if agreeing <= sample_size:
         return inf
     tests = log(models_per_sample * (count - sample_size))
-    tests += _log_binomial(count, agreeing) + _log_binomial(agreeing, sample_size)
+    tests += log_binomial(count, agreeing) + log_binomial(agreeing, sample_size)
     return (tests + (agreeing - sample_size) * log(min(chance, 1.0))) / log(10)
-
-
-def _log_binomial(count: int, chosen: int) -> float:
-    return lgamma(count + 1) - lgamma(chosen + 1) - lgamma(count - chosen + 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,26 +15,17 @@ Pose = tuple[np.ndarray, np.ndarray]
 """A rotation (3, 3) and a translation (3,). They map a point X0 in the frame of the first camera to
 X1 = rotation @ X0 + translation in the frame of the second."""
 
-BLOCK = 100_000
-"""`triangulate` processes at most this number of matches at once, because it needs much memory."""
+BLOCK, MAX_MATCHES = 100_000, 50_000
+"""`triangulate` processes at most BLOCK matches at once, because it needs much memory. A pose is
+fitted to at most MAX_MATCHES, because more do not improve it."""
 
-MAX_ITERATIONS = 10
-"""Gauss-Newton stops after this many steps. Chosen by hand."""
+MAX_ITERATIONS, DERIVATIVE_STEP, MIN_CHANGE = 10, 1e-6, 1e-9
+"""Gauss-Newton stops after so many steps, or when none of the five angles changes by more than
+MIN_CHANGE. Numerical derivatives vary each by DERIVATIVE_STEP (both in radians)."""
 
-DERIVATIVE_STEP = 1e-6
-"""Numerical derivatives vary each parameter of the pose by this angle, in radians."""
-
-MIN_CHANGE = 1e-9
-"""The refinement ends when no parameter of the pose changes by more than this, in radians."""
-
-MAX_REFITS = 4
-"""The pose is refitted to its inliers at most this many times. Chosen by hand."""
-
-MIN_INLIER_GAIN = 0.01
-"""Refitting ends if the number of inliers grows by at most this fraction. Chosen by hand."""
-
-MAX_MATCHES = 50_000
-"""The pose is fitted to at most this number of matches, because more do not improve it."""
+MAX_REFITS, MIN_INLIER_GAIN = 4, 0.01
+"""A pose is refitted to its inliers at most so often, while their number grows by more than the
+fraction MIN_INLIER_GAIN. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +55,7 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate (N, 2) matches in pixels; the pose is X1 = rotation @ X0 + translation.
 
-    Each match is first moved onto corresponding epipolar lines by `correct_matches`, so that its
-    two rays meet. This is the maximum likelihood estimate if the noise in both images is equal.
+    `correct_matches` first makes the two rays meet: the maximum likelihood for equal noise.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -78,8 +68,7 @@ def triangulate(
     fundamental = fundamental_matrix(calibration, rotation, translation)
     moved0, moved1 = correct_matches(points0, points1, fundamental)
     camera0, camera1 = calibration.camera0, calibration.camera1
-    rays0 = camera0.rays(moved0)
-    rays1 = camera1.rays(moved1)
+    rays0, rays1 = camera0.rays(moved0), camera1.rays(moved1)
     rotated = rays0 @ rotation.T
     # Solve ray1 x (depth * rotated + translation) = 0 for the depth.
     normals = np.cross(rays1, rotated)
@@ -167,11 +156,8 @@ def estimate_relative_pose(
     The threshold is a Sampson distance in pixels. Returns None if there are too few matches or the
     estimation fails.
     """
-    essential = GeometryOptions(
-        inlier_threshold=inlier_threshold,
-        camera0=calibration.camera0.matrix,
-        camera1=calibration.camera1.matrix,
-    )
+    matrices = calibration.camera0.matrix, calibration.camera1.matrix
+    essential = GeometryOptions(inlier_threshold, None, *matrices)
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     sample = _evenly(np.arange(len(points0)))
@@ -242,11 +228,7 @@ def refine_pose(
 
 
 def moved_pose(pose: Pose, change: np.ndarray) -> Pose:
-    """Return a pose that differs from the given one by five small angles in radians.
-
-    The first three angles change the rotation. The other two change the direction of the
-    translation, whose length stays 1.
-    """
+    """Change a pose by five small angles: three of the rotation, two of the direction."""
     rotation, translation = pose
     small = cv2.Rodrigues(np.asarray(change[:3], np.float64))[0]
     least = np.eye(3)[np.abs(translation).argmin()]
@@ -265,10 +247,7 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def best_of_four(
     essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of an essential matrix with the most points in front of both cameras.
-
-    The essential matrix is in normalised coordinates, and the (M, 2) matches are in pixels.
-    """
+    """Return the pose of an essential matrix with the most points in front of both cameras."""
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
     points0, points1 = _evenly(points0), _evenly(points1)
     poses = [

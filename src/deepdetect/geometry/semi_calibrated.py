@@ -1,11 +1,9 @@
 """Estimate the fundamental matrix of two ordinary cameras whose focal length is not known.
 
-Three assumptions hold for most pairs of images: pixels are square, the principal point lies near
-the middle of the image, and both images were taken with about the same focal length. RANSAC is run
-for each of a few focal lengths. With a given focal length, a sample needs only five matches, while
-a sample for a fundamental matrix needs seven. Therefore more samples contain no wrong match. The
-focal length whose inliers are the best evidence is kept. Then the pose and the parameters of both
-cameras are fitted to these inliers together.
+Most pairs have square pixels, principal points near the middle, and similar focal lengths. RANSAC
+is run for each of a few focal lengths: samples of five matches, not seven as for a fundamental
+matrix, are more often free of wrong ones. Pose and cameras are then fitted together to the inliers
+of the focal length with the best evidence.
 """
 
 from __future__ import annotations
@@ -21,45 +19,28 @@ from .estimation import TwoViewModel, fit_essential, fit_shuffled, log10_nfa
 from .relative_pose import Pose, best_of_four, moved_pose
 from .transforms import epipolar_errors, signed_epipolar_errors
 
-MODELS_PER_SAMPLE = 10
-"""The solver finds up to ten essential matrices for each sample of five matches."""
+MIN_MATCHES, MODELS_PER_SAMPLE = 6, 10
+"""An essential matrix needs five matches, which up to ten fit, and a sixth one to test it."""
 
-START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
-"""Candidates for the initial focal length of a fit, in units of the longer side of the image. A fit
-starts from the one that makes the fundamental matrix most nearly essential. Chosen by hand."""
+FOCAL_LENGTHS, START_FOCAL_LENGTHS = (0.7, 1.4), np.geomspace(0.4, 2.5, 12)
+"""Focal lengths in units of the longer side of the image. RANSAC is run with each of the first, as
+good as a dense range from 90 to 28 degrees. A fit to a fundamental matrix starts from the one of
+the second, chosen by hand, that makes it most nearly essential."""
 
-MIN_MATCHES = 6
-"""An essential matrix needs five matches, and a sixth one to test it."""
+CONFIDENCE, ITERATIONS = 0.9999, 5000
+"""RANSAC stops when at least one sample was free of outliers with this probability, and after so
+many samples for each focal length. Chosen by hand."""
 
-FOCAL_LENGTHS = (0.7, 1.4)
-"""RANSAC is run with each of these focal lengths, in units of the longer side of the image. These
-two give results as good as a dense range that covers fields of view from 90 to 28 degrees."""
-
-CONFIDENCE = 0.9999
-"""RANSAC stops when at least one sample was free of outliers with this probability."""
-
-ITERATIONS = 5000
-"""RANSAC draws at most this many samples for each focal length. Chosen by hand."""
-
-FOCAL_SPREAD = 0.7
-"""The prior is that ln(focal length / longer side of the image), averaged over the two cameras, has
-the mean 0 and this standard deviation. Chosen by hand."""
-
-FOCAL_DIFFERENCE = 0.03
-"""The prior is that ln(focal length 0 / focal length 1), each in units of the longer side of its
-image, has the mean 0 and this standard deviation. Chosen by hand."""
-
-PRINCIPAL_POINT_SPREAD = 0.03
-"""Prior standard deviation of cx and cy, in units of the longer image side. Chosen by hand."""
+FOCAL_SPREAD, FOCAL_DIFFERENCE, PRINCIPAL_POINT_SPREAD = 0.7, 0.03, 0.03
+"""Prior standard deviations, in units of the longer side of the image: of the mean logarithm of the
+focal lengths from 0, of their difference, and of cx and cy from the middle. Chosen by hand."""
 
 MATCH_SIGMA_PX = 0.5
 """Standard deviation of correct matches from their epipolar lines. Chosen by hand."""
 
-MAX_FITS = 4
-"""Pose and cameras are fitted to the inliers at most this many times. Chosen by hand."""
-
-MAX_ITERATIONS = 20
-"""Levenberg-Marquardt stops after this many steps. Chosen by hand."""
+MAX_FITS, MAX_ITERATIONS = 4, 20
+"""Pose and cameras are fitted to the inliers at most so often, each time with at most so many steps
+of Levenberg-Marquardt. Chosen by hand."""
 
 
 def estimate_semi_calibrated(
@@ -71,8 +52,7 @@ def estimate_semi_calibrated(
 ) -> TwoViewModel | None:
     """Estimate a fundamental matrix from (M, 2) matches, many of which may be wrong.
 
-    `sizes` are the (width, height) of the two images, and the threshold is a Sampson distance in
-    pixels. Returns None if there are too few matches or the estimation fails.
+    The threshold is a Sampson distance in pixels. Returns None if the estimation fails.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -124,9 +104,8 @@ def refine_fundamental(
 ) -> np.ndarray:
     """Refine a fundamental matrix by matches, most of them correct, and a prior on the cameras.
 
-    The prior decides what the matches hardly determine, such as the focal length. `match_sigmas_px`
-    are the (M,) expected standard deviations of the matches' distances from their epipolar lines.
-    The result has norm 1. If there are fewer than six matches, the given matrix is returned.
+    `match_sigmas_px` are the (M,) expected standard deviations of the matches' distances from their
+    epipolar lines. The result has norm 1; fewer than six matches change nothing.
     """
     if len(points0) < MIN_MATCHES:
         return fundamental
@@ -149,11 +128,10 @@ def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Came
 
 @dataclass(frozen=True, eq=False)
 class _Cameras:
-    """The two cameras, as six parameters.
+    """The two cameras, as six parameters in units of the longer side of each image.
 
-    `log_focal` has the (2,) natural logarithms of their focal lengths. `offsets` has one row (x, y)
-    for each camera: its principal point minus the image centre. Focal lengths and offsets are in
-    units of the longer side of each image.
+    `log_focal` (2,) are natural logarithms of the focal lengths, and `offsets` (2, 2) the principal
+    points minus the image centres.
     """
 
     sizes: tuple[Size, Size]
@@ -187,7 +165,6 @@ class _Cameras:
         return calibration.camera1.matrix.T @ fundamental @ calibration.camera0.matrix
 
     def moved(self, change: np.ndarray) -> _Cameras:
-        """Return these cameras with a (6,) change added to their parameters."""
         if not change.any():  # keeps the cached inverses
             return self
         offsets = self.offsets + change[2:].reshape(2, 2)
@@ -217,16 +194,10 @@ def _moved(views: Views, change: np.ndarray) -> Views:
 def _fit_essential(
     points0: np.ndarray, points1: np.ndarray, cameras: _Cameras, inlier_threshold: float
 ) -> np.ndarray | None:
-    calibration = cameras.calibration
-    camera0, camera1 = calibration.camera0, calibration.camera1
-    return fit_essential(
-        camera0.rays(points0),
-        camera1.rays(points1),
-        (camera0.focal_px[0] + camera1.focal_px[0]) / 2,
-        inlier_threshold,
-        CONFIDENCE,
-        ITERATIONS,
-    )
+    camera0, camera1 = cameras.calibration.camera0, cameras.calibration.camera1
+    focal_px = (camera0.focal_px[0] + camera1.focal_px[0]) / 2
+    rays = camera0.rays(points0), camera1.rays(points1)
+    return fit_essential(*rays, focal_px, inlier_threshold, CONFIDENCE, ITERATIONS)
 
 
 def _fit(views: Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> Views:

@@ -39,23 +39,14 @@ MIN_PLANAR_RATIO = 0.75
 """A scene is a plane only if the homography has at least this fraction of the number of inliers of
 the fundamental matrix. Chosen like `SCENE_THRESHOLDS_PX`."""
 
-MAX_MEDIAN_MOTION_PX = 0.5
-"""Two images show the same view only if the median distance that the matches move is below this."""
+MAX_MEDIAN_MOTION_PX, MAX_MOTION_PX, MOTION_QUANTILE = 0.5, 3.0, 0.9
+"""Two images show the same view only if the median of the distances that matches move is below the
+first, and their MOTION_QUANTILE below the second. Chosen like `SCENE_THRESHOLDS_PX`."""
 
-MAX_MOTION_PX, MOTION_QUANTILE = 3.0, 0.9
-"""Two images show the same view only if the MOTION_QUANTILE of the distances that matches move is
-below MAX_MOTION_PX. Chosen like `SCENE_THRESHOLDS_PX`."""
-
-FOREGROUND_DISTANCE_PX = 6.0
-"""A match is clearly off the plane if its transfer error under the homography is above this."""
-
-MIN_FOREGROUND_FRACTION = 0.05
-"""There is a foreground only if at least this fraction of the inliers of the fundamental matrix is
-clearly off the plane. Chosen like `SCENE_THRESHOLDS_PX`."""
-
-MIN_FOREGROUND_ON_LINES = 0.8
-"""There is a foreground only if at least this fraction of the matches clearly off the plane are
-inliers of the fundamental matrix. On 16 planar pairs of Oxford, the fraction is at most 0.65."""
+FOREGROUND_DISTANCE_PX, MIN_FOREGROUND_FRACTION, MIN_FOREGROUND_ON_LINES = 6.0, 0.05, 0.8
+"""A match is clearly off the plane if its transfer error is above the first. There is a foreground
+only if as many matches as the second fraction of the fundamental matrix's inliers are, and the
+third fraction of them are inliers, which is at most 0.65 on 16 planar pairs of Oxford."""
 
 
 def fit_model(
@@ -162,8 +153,7 @@ def is_planar(
 def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool:
     """Return whether something stands in front of the plane, even if it is small.
 
-    `off_plane_px` are the (M,) transfer errors of the homography. `by_fundamental` is (M,) bool,
-    True for the inliers of the fundamental matrix.
+    Arguments are the (M,) transfer errors of the homography, and the fundamental matrix's inliers.
     """
     clear = off_plane_px > FOREGROUND_DISTANCE_PX
     foreground = np.count_nonzero(clear & by_fundamental)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,10 @@ standard, and mm and micrometre, which cameras also use."""
 TRANSPOSED = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
 
-MAX_FOCAL_DIFFERENCE = 0.1
-"""The focal length computed from the sensor resolution is more precise than the 35 mm equivalent
-but often wrong. It is used if the two differ by at most this fraction. Chosen by hand."""
-
-MAX_ASPECT_DIFFERENCE = 0.01
-"""If the aspect ratios of a photograph and of its EXIF differ by more than this fraction, the
-photograph counts as cropped. Chosen by hand."""
+MAX_FOCAL_DIFFERENCE, MAX_ASPECT_DIFFERENCE = 0.1, 0.01
+"""The focal length computed from the sensor resolution is more precise than the 35 mm equivalent,
+but often wrong: it is used if they differ by at most the first fraction. A photograph whose aspect
+ratio differs from that of its EXIF by more than the second was cropped. Chosen by hand."""
 
 ADVICE = "give `focal_px` or `calibration`"
 
@@ -49,8 +47,10 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
         ReconstructionError: there is no usable focal length, or the photograph was cropped later.
     """
     name = file_name(image)
-    tags, orientation = _tags(image)
-    turned = orientation in TRANSPOSED
+    tags, notes = read_tags(image)
+    # The HEIF plug-in turns images upright and resets the usual tag; PIL images are not turned.
+    orientation = notes.get("original_orientation") or tags.get(Base.Orientation, 1)
+    turned = is_file(image) and orientation in TRANSPOSED
     own = (size[1], size[0]) if turned else size
     taken = (_number(tags.get(Base.ExifImageWidth)), _number(tags.get(Base.ExifImageHeight)))
     if not min(taken) > 0:
@@ -80,20 +80,14 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
     return length * across / unit * scale, length * down / unit * scale
 
 
-def _tags(image: Any) -> tuple[dict[int, Any], int]:
-    """Read the EXIF tags and orientation: 1 for PIL images, which `load_image` does not turn."""
+def read_tags(image: Any) -> tuple[dict[int, Any], dict[str, Any]]:
+    """Read the EXIF tags of a file or a PIL image, and Pillow's notes with its size, if any."""
     try:
-        if hasattr(image, "getexif"):
-            return dict(image.getexif().get_ifd(IFD.Exif)), 1
-        if not is_file(image):
-            return {}, 1
-        with open_image(image) as opened:
+        with open_image(image) if is_file(image) else nullcontext(image) as opened:
             exif = opened.getexif()
-            # The HEIF plug-in turns images upright and resets the usual tag.
-            orientation = opened.info.get("original_orientation") or exif.get(Base.Orientation, 1)
-            return dict(exif.get_ifd(IFD.Exif)), int(orientation)
+            return dict(exif) | exif.get_ifd(IFD.Exif), opened.info | {"size": opened.size}
     except Exception:  # Pillow raises many types of errors; broken tags are ignored
-        return {}, 1
+        return {}, {}
 
 
 def _number(value: Any) -> float:

@@ -6,12 +6,13 @@ import re
 from typing import Any
 
 import numpy as np
-from PIL.ExifTags import IFD, Base
+from PIL.ExifTags import Base
 
 from .._shared.errors import ImageError
 from .._shared.opencv import cv2
+from .exif import read_tags
 from .image import luma
-from .image_file import RAW_SUFFIXES, file_name, is_file, is_path, open_image
+from .image_file import RAW_SUFFIXES, file_name, is_path
 
 MIN_ASPECT, MAX_ASPECT = 1.95, 2.05
 """A panorama of 360 degrees is at least MIN_ASPECT times as wide as high. Up to MAX_ASPECT it is a
@@ -43,10 +44,14 @@ def require_pinhole(
     picture on black is that of a fisheye. A plane seen through an eyepiece looks the same. An image
     that is no file has the `name` in the message.
     """
-    tags, projection, size = _metadata(image)
+    raw = file_name(image).lower().endswith(RAW_SUFFIXES)
+    tags, notes = ({}, {}) if raw else read_tags(image)
+    xmp = notes.get("xmp") or b""
+    xmp = xmp if isinstance(xmp, str) else xmp.decode("utf-8", "ignore")
+    projection = re.search(r"GPano:ProjectionType\W+(?!rectilinear)\w", xmp)
     lens = f"{tags.get(Base.LensMake, '')} {tags.get(Base.LensModel, '')}"
     gray = np.zeros((1, 1), np.uint8) if rgb is None else luma(rgb)
-    width, height = size or gray.shape[::-1]
+    width, height = notes.get("size") or gray.shape[::-1]
     sphere = MIN_ASPECT * height <= width <= MAX_ASPECT * height
     form, how = "e:flat", VIEWS
     if tags.get(Base.CustomRendered) == 6 or (projection and not sphere):  # 6: iPhones' panoramas
@@ -115,17 +120,3 @@ def is_round(gray: np.ndarray, beside: int = 0) -> bool:
     spare = 2 * (1 - ROUNDNESS[0])
     least, most = (1 - spare) * SIDE_PX, (1 + spare) * min(max(small.shape), MAX_CUT * SIDE_PX)
     return bool(least <= 2 * radius <= most and filled.sum() >= ROUNDNESS[beside] * disc.sum())
-
-
-def _metadata(image: Any) -> tuple[dict[int, Any], str, tuple[int, int] | None]:
-    """Read EXIF, the projection of a panorama, "" if there is none, and the size of a file."""
-    try:
-        if not is_file(image) or file_name(image).lower().endswith(RAW_SUFFIXES):
-            return {}, "", None
-        with open_image(image) as opened:
-            tags, xmp = dict(opened.getexif().get_ifd(IFD.Exif)), opened.info.get("xmp") or b""
-            text = xmp if isinstance(xmp, str) else xmp.decode("utf-8", "ignore")
-            found = re.search(r"GPano:ProjectionType\W+(?!rectilinear)(\w+)", text)
-            return tags, found[1] if found else "", opened.size
-    except Exception:  # Pillow raises many types of errors; broken tags are ignored
-        return {}, "", None

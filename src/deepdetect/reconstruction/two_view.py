@@ -24,35 +24,26 @@ from ..geometry.two_view import SCENE_THRESHOLDS_PX, classify_scene
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners
 
-MAX_EPIPOLAR_DISTANCE_PX = 1.0
-"""A match agrees with the pose if its Sampson distance is below this. Chosen by hand."""
+MAX_EPIPOLAR_DISTANCE_PX, MAX_REPROJECTION_ERROR_PX = 1.0, 0.5
+"""A match agrees with the pose if its Sampson distance is below the first, and the root mean square
+reprojection error of its point in both images below the second. Chosen by hand."""
 
-MAX_REPROJECTION_ERROR_PX = 0.5
-"""Maximum root mean square reprojection error of a point in both images. Chosen by hand."""
-
-POSE_CELLS = 10_000
-"""The pose is estimated from the best corner in each of about this many cells. Chosen by hand."""
-
-GRID_SIZE_PX = 16
-"""The first image is divided into cells with this side. The checks use one match from each cell,
-because neighbouring matches are not independent evidence. Chosen by hand."""
+POSE_CELLS, GRID_SIZE_PX = 10_000, 16
+"""The pose is estimated from the best corner in each of about POSE_CELLS cells. The checks use one
+match from each cell with the side GRID_SIZE_PX, because neighbouring matches are not independent
+evidence. Chosen by hand."""
 
 MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
 """A pose explains a match if the Sampson distance is below this, as for a fundamental matrix."""
 
-MIN_POSE_RATIO = 0.75
+MIN_POSE_RATIO, MIN_IN_FRONT_FRACTION = 0.75, 0.75
 """A pose is accepted only if it explains at least this fraction of the number of matches that the
-fundamental matrix explains. A correct calibration gives about 1. Chosen by hand."""
+fundamental matrix explains (a correct calibration gives about 1), and has this fraction of its
+inliers in front of both cameras. Chosen by hand."""
 
-MIN_IN_FRONT_FRACTION = 0.75
-"""A pose must have this fraction of its inliers in front of both cameras. Chosen by hand."""
-
-FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
-"""These multiples of the given focal length are also tried, to check it."""
-
-MAX_FOCAL_ERROR_RATIO = 0.5
-"""The given focal length is rejected if another one has less than this fraction of its median
-error. A focal length that is wrong by a fifth is still accepted."""
+FOCAL_FACTORS, MAX_FOCAL_ERROR_RATIO = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0), 0.5
+"""The given focal length is rejected if one of these multiples has less than this fraction of its
+median error. A focal length that is wrong by a fifth is still accepted."""
 
 GOOD_ERROR_PX = 0.1
 """No other focal length is tried if the given one has a median error below this. Chosen by hand."""
@@ -164,9 +155,8 @@ def check_matches(
 ) -> tuple[np.ndarray, TwoViewModel]:
     """Raise a NoDepthError if (M, 2) matches show no overlap, no motion, or no depth.
 
-    One match from each cell of a grid is used. Returns the (K,) indices of these matches, and the
-    fundamental matrix that is fitted to them. With a calibration, the message can distinguish a
-    rotation of the camera from a plane.
+    One match from each cell of a grid is used. Returns their (K,) indices, and their fundamental
+    matrix. With a calibration, the message can tell a rotation from a plane.
     """
     if not len(points0):
         raise NoDepthError(
@@ -191,10 +181,9 @@ def check_pose(
     epipolar: TwoViewModel,
     calibration: Calibration,
 ) -> RelativePose:
-    """Raise a ReconstructionError if a pose explains far fewer matches than a fundamental matrix.
+    """Return the pose of all matches, or raise a ReconstructionError if the calibration is wrong.
 
-    The reason is then a wrong calibration. The pose was estimated from all matches; `indices` and
-    `epipolar` are the results of `check_matches`. Returns the pose.
+    It then explains far fewer matches than `epipolar` of `check_matches`, with their `indices`.
     """
     wrong_focal = _wrong_focal(calibration)
     if pose is None:
@@ -222,9 +211,8 @@ def check_focal(
 ) -> None:
     """Raise a ReconstructionError if a very different focal length fits the matches far better.
 
-    The (M, 2) matches are those that the fundamental matrix explains, and `errors` are their (M,)
-    Sampson distances under the pose. If the camera only moved sideways, every focal length fits,
-    and a wrong one is not noticed.
+    The (M, 2) matches fit the fundamental matrix, and `errors` (M,) are their Sampson distances
+    under the pose. If the camera only moved sideways, every focal length fits.
     """
     given = float(np.median(errors))
     if given < GOOD_ERROR_PX:

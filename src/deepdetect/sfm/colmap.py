@@ -24,16 +24,13 @@ from ..features.learned import is_learned
 from ..geometry.camera import Calibration, Camera
 from ..io.exif import camera_from_exif
 
-PIXEL_CENTRE = 0.5
-"""COLMAP has the centre of the first pixel at (0.5, 0.5), this package at (0, 0)."""
+PIXEL_CENTRE, SIFT_NUMBERS = 0.5, 128
+"""COLMAP has the centre of the first pixel at (0.5, 0.5), this package at (0, 0). Its descriptors
+have SIFT_NUMBERS numbers."""
 
-SIFT_NUMBERS = 128
-
-CENTRE_TOLERANCE_PX = 1e-6
-"""A principal point this close to the middle, in pixels, is in the middle up to rounding errors."""
-
-ROWS = 256
-"""An image is undistorted in strips of this number of rows, which limits the memory needed."""
+CENTRE_TOLERANCE_PX, ROWS = 1e-6, 256
+"""A principal point this close to the middle is in the middle up to rounding errors. An image is
+undistorted in strips of ROWS rows, which limits the memory needed."""
 
 ESTIMATED_FOCAL_FACTOR = 1.2
 """Guess of an unknown focal length, relative to the image's longer side, as in COLMAP."""
@@ -289,9 +286,8 @@ def orientations_of(points: Keypoints) -> np.ndarray:
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
     """Convert descriptors to SIFT's format, (N, 128) uint8. Return None if this is impossible.
 
-    The 64 signed numbers of a learned descriptor become 128 numbers from 0 up: the positive parts,
-    then the absolute values of the negative parts. Descriptors of length 1 are multiplied by 512,
-    as is usual for SIFT. Rounding them loses one or two of 100 correct matches.
+    Learned descriptors, 64 signed numbers, become their positive and their negative parts. Those of
+    length 1 are multiplied by 512 as in SIFT: rounding loses 1 or 2 of 100 correct matches.
     """
     found = keypoints.descriptors
     if found is not None and is_learned(keypoints.descriptor_type):

@@ -27,32 +27,25 @@ MIN_VERIFIED = 30
 """A pair of images is used only if its two-view geometry has at least this number of inliers. Some
 20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
 
-MAX_VERIFICATION_ERROR_PX = 4.0
-"""A match is an inlier if its geometric error is at most this, which is COLMAP's default."""
-
-MAX_TRIALS = 5000
-"""RANSAC draws at most this number of samples per pair of images. With COLMAP's 10,000, many pairs
-that show different places would take more time than the mapping."""
+MAX_VERIFICATION_ERROR_PX, MAX_TRIALS = 4.0, 5000
+"""An inlier has at most this geometric error (COLMAP's default). RANSAC draws at most MAX_TRIALS
+samples: with COLMAP's 10,000, pairs of different places would take longer than the mapping."""
 
 MIN_VIEWS = 3
 """A model needs at least this number of images. The function `reconstruct` is for two."""
 
-MAX_MODELS = 5
-"""Unconnected groups of images become at most this number of models. Chosen by hand."""
-
-MAX_FIRST_PAIRS = 20
-"""The mapping tries at most this number of pairs of images as its first pair. Chosen by hand."""
+MAX_MODELS, MAX_FIRST_PAIRS = 5, 20
+"""Unconnected groups of images become at most MAX_MODELS models, for each of which at most
+MAX_FIRST_PAIRS are tried as its first pair. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
 """The mapping begins with two images whose lines of sight form 16 degrees, and between which the
 camera did not move straight ahead, as in COLMAP. If there is no such pair, or more connected images
 are left out than mapped, a retry allows such motion and angles down to this. Chosen by hand."""
 
-ROBUST_SCALE_PX = 1.0
-"""Scale of the Cauchy loss in bundle adjustment: larger errors count less. Chosen by hand."""
-
-MAX_REFINED_ERROR_PX = 1.0
-"""Observations of refined tracks with larger errors are removed: they show something else."""
+ROBUST_SCALE_PX, MAX_REFINED_ERROR_PX = 1.0, 1.0
+"""The scale of the Cauchy loss in bundle adjustment was chosen by hand. Observations of refined
+tracks with errors above the second show something else and are removed."""
 
 ROUGH_TOLERANCE, TOLERANCE = 1e-6, 1e-8
 """Bundle adjustment ends when a step reduces the cost by less than this fraction. `ROUGH_TOLERANCE`
@@ -119,10 +112,9 @@ class SparseModel:
 
 
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
-    """Verify matched pairs by their two-view geometry, which is stored in the database.
+    """Store the two-view geometries of matched pairs; return the inliers of the verified pairs.
 
-    Returns the number of inliers of each pair that has at least `MIN_VERIFIED`, without pairs that
-    agree only on what stands still at the border of both images, a watermark.
+    These have at least `MIN_VERIFIED`, not only on what stands still at the border, a watermark.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_VERIFIED)
@@ -151,9 +143,8 @@ def map_images(
 ) -> tuple[Any, list[frozenset[str]]]:
     """Estimate the poses of connected images one after the other, from verified pairs.
 
-    With `known_cameras`, all intrinsics stay fixed. `registered` is called with the number of
-    images just added. Returns the largest `pycolmap.Reconstruction` and, for each smaller one, the
-    names of its images.
+    With `known_cameras`, all intrinsics stay fixed. `registered` gets the number of images just
+    added. Returns the largest `pycolmap.Reconstruction`, and the names of the images in each other.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
@@ -209,12 +200,8 @@ def map_globally(
 
 
 def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
-    """Return the models, largest first, without those where most estimated cameras are implausible.
-
-    With few points, focal length and distortion may diverge until nothing can be triangulated.
-    """
-    limits = MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION
-    found = []
+    """Return the models, largest first, unless estimated cameras diverged for lack of points."""
+    limits, found = (MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION), []
     for model in models.values():
         cameras = [model.images[number].camera for number in model.reg_image_ids()]
         bogus = sum(camera.has_bogus_params(*limits) for camera in cameras)
@@ -224,10 +211,7 @@ def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
 
 
 def _largest(found: Sequence[Any], tried: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
-    """Return the largest model, and the names of the images in each other model.
-
-    `found` are the sound models, largest first. If there are none, a NoDepthError says why.
-    """
+    """Return the first of the sound models `found`, and the names of the images in each other."""
     if not found and any(_size(model) >= MIN_VIEWS for model in tried):
         raise NoDepthError(
             "focal length and distortion cannot be estimated from these images: give `calibration` "
