@@ -262,12 +262,12 @@ def _fit(
     if model == "fundamental":
         return cv2.findFundamentalMat(*sought, confidence, iterations)[0]
     cameras = _cameras(options)
-    rays = [
+    rays0, rays1 = (
         np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(camera).T
         for points, camera in zip((points0, points1), cameras, strict=True)
-    ]
+    )
     focal_px = (cameras[0][0, 0] + cameras[1][0, 0]) / 2
-    return fit_essential(*rays, focal_px, threshold, confidence, iterations)
+    return fit_essential(rays0, rays1, focal_px, threshold, confidence, iterations)
 
 
 def fit_essential(

@@ -18,7 +18,7 @@ MIN_ASPECT, MAX_ASPECT = 1.95, 2.05
 """A panorama of 360 degrees is at least MIN_ASPECT times as wide as high. Up to MAX_ASPECT it is a
 sphere (2, up to resizing), otherwise it may be a cylinder."""
 
-ROWS, SHARPEST, FAR, MARGIN = 512, 0.003, (1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2), 1.4
+ROWS, SHARPEST, FAR, MARGIN = 512, 0.003, (1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2), 1.5
 """Edges meet if they differ MARGIN times less than any two columns at the distances FAR (of the
 width), and no more than neighbours without the SHARPEST part, which are outlines of things. A plain
 background is mostly wider than 1/16, so that far columns are alike. Some ROWS are compared, which
