@@ -292,6 +292,11 @@ def test_a_fisheye_is_no_pinhole(pycolmap, lens, params, degrees) -> None:
         ("SIMPLE_RADIAL", [340.0, 320, 240, -0.15], 55),
         ("SIMPLE_PINHOLE", [231.0, 320, 240], 70),
         ("OPENCV", [430.0, 430, 321, 242, -0.12, 0.09, 0.0003, 0.0003], 50),
+        (
+            "OPENCV",
+            [390.0, 390, 313, 244, -0.283, 0.074, 0.0002, 0.00002],
+            48,
+        ),  # moves them by 20 %
     ],
 )
 def test_distorting_lenses_stay_pinholes(pycolmap, lens, params, degrees) -> None:

@@ -1,7 +1,7 @@
 """Recognise lenses that bend straight lines, from the matches of two images.
 
-A bilinear constraint x1^T B x0 = 0 is fitted to the matches, without distortion (B is then a
-fundamental matrix) and with the division model (Fitzgibbon, "Simultaneous linear estimation of
+A constraint x1^T B x0 = 0 and a homography are fitted to the matches, without distortion (B is then
+a fundamental matrix) and with the division model (Fitzgibbon, "Simultaneous linear estimation of
 multiple view geometry and lens distortion", 2001), which also fits fisheyes of over 180 degrees.
 """
 
@@ -25,6 +25,11 @@ MIN_DEVIATIONS = 6.0
 """A lens fits better if the mean cost of the matches falls by this number of standard deviations
 (Vuong's test). The largest of 201 pairs by pinholes is 4.3, in a street with moving clouds, and the
 second 1.9. Fisheyes reach 5 to 30."""
+
+MIN_FLAT_DEVIATIONS, MIN_FLAT_RATIO, NEAR = 15.0, 2 / 3, 3.0
+"""Of a plane, or if the camera turned, a distorted homography fits better by this number of
+deviations, and fits at least this fraction of the matches that fit a pinhole's epipolar lines,
+within NEAR times `SCALE`. A curved cloth has 8 and 0.55, turning fisheyes have 20 to 70 and 0.7 to 0.9."""
 
 UNDISTORT = "undistort them with the lens's calibration (cv2.undistort, cv2.fisheye)"
 
@@ -53,37 +58,70 @@ def distortion(
     """
     if len(points0) < MIN_MATCHES:
         return 0.0
-    normalised = [
+    xy = [
         (points - (np.array(size) - 1) / 2) / (np.hypot(*size) / 2)
         for points, size in zip((points0, points1), sizes, strict=True)
     ]
-    straight = _costs(normalised, 0.0, agreeing, SCALES)
-    bent = [_costs(normalised, each, agreeing, SCALES) for each in DISTORTIONS]
+    found, straight, _ = _compared(xy, agreeing, False, MIN_DEVIATIONS)
+    if found:
+        return found
+    found, _, bent = _compared(xy, agreeing, True, MIN_FLAT_DEVIATIONS)
+    near = np.log1p(NEAR**2)
+    most = np.count_nonzero(bent < near) >= MIN_FLAT_RATIO * np.count_nonzero(straight < near)
+    return found if most else 0.0
+
+
+def _compared(
+    xy: list[np.ndarray], agreeing: np.ndarray, flat: bool, least: float
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return the distortion that fits better by `least` deviations, or 0, and costs without, with.
+
+    `xy` are the positions from the middle of the image, in half diagonals.
+    """
+    straight = _costs(xy, 0.0, agreeing, SCALES, flat)
+    bent = [_costs(xy, each, agreeing, SCALES, flat) for each in DISTORTIONS]
     best = int(np.argmin([costs.sum() for costs in bent]))
-    if DISTORTIONS[best] < MIN_DISTORTION or deviations(straight, bent[best]) < MIN_DEVIATIONS:
-        return 0.0
+    if DISTORTIONS[best] < MIN_DISTORTION or deviations(straight, bent[best]) < least:
+        return 0.0, straight, bent[best]
     for costs in bent:  # a pinhole may also fit, but only from where these fits have led
         for scales in (SCALES[1:], SCALES[4:]):
-            again = _costs(normalised, 0.0, np.exp(-costs), scales)
+            again = _costs(xy, 0.0, np.exp(-costs), scales, flat)
             straight = min(straight, again, key=np.sum)
-    clear = deviations(straight, bent[best]) >= MIN_DEVIATIONS
-    return DISTORTIONS[best] if clear else 0.0
+    clear = deviations(straight, bent[best]) >= least
+    return DISTORTIONS[best] if clear else 0.0, straight, bent[best]
 
 
 def _costs(
-    normalised: list[np.ndarray], distortion: float, weights: np.ndarray, scales: np.ndarray
+    xy: list[np.ndarray], distortion: float, weights: np.ndarray, scales: np.ndarray, flat: bool
 ) -> np.ndarray:
-    """Fit the constraint by iterated reweighting; return the (M,) costs at the scale `SCALE`."""
-    lifted = [np.column_stack([xy, 1 - distortion * (xy**2).sum(axis=1)]) for xy in normalised]
-    rows = (lifted[1][:, :, None] * lifted[0][:, None, :]).reshape(-1, 9)
+    """Fit a constraint by iterated reweighting; return the (M,) costs at the scale `SCALE`."""
+    first, second = (np.column_stack([p, 1 - distortion * (p**2).sum(axis=1)]) for p in xy)
+    products = second[:, :, None] * first[:, None, :]
+    if flat:  # second is parallel to H first
+        x, y, z = products.transpose(1, 0, 2)
+        rows = np.hstack([np.zeros_like(x), -z, y, z, np.zeros_like(x), -x]).reshape(-1, 2, 9)
+    else:  # second^T B first = 0
+        rows = products.reshape(-1, 1, 9)
     weights = weights + 1e-6
     for scale in scales:
-        vector = np.linalg.eigh(rows.T @ (rows * weights[:, None]))[1][:, 0]
-        matrix, squares = vector.reshape(3, 3), np.full(len(rows), 1e-30)
-        lines = lifted[1] @ matrix, lifted[0] @ matrix.T
-        for line, xy in zip(lines, normalised, strict=True):
-            squares += ((line[:, :2] - 2 * distortion * line[:, 2:] * xy) ** 2).sum(axis=1)
-        errors = (rows @ vector) ** 2 / squares  # squared Sampson distances
+        weighted = (rows * weights[:, None, None]).reshape(-1, 9)
+        matrix = np.linalg.eigh(weighted.T @ rows.reshape(-1, 9))[1][:, 0].reshape(3, 3)
+        if flat:
+            rays = first @ matrix.T * np.sign(np.median((first @ matrix.T * second)[:, 2]))
+            squares = (rays**2).sum(axis=1) * (second**2).sum(axis=1)
+            errors = ((_distorted(rays, distortion) - xy[1]) ** 2).sum(axis=1)
+        else:
+            squares = np.full(len(first), 1e-30)
+            for line, p in zip((second @ matrix, first @ matrix.T), xy, strict=True):
+                squares += ((line[:, :2] - 2 * distortion * line[:, 2:] * p) ** 2).sum(axis=1)
+            errors = (rows[:, 0] @ matrix.ravel()) ** 2 / squares  # squared Sampson distances
         weights = 1 / (squares * (1 + errors / scale**2))
         weights /= weights.mean()
     return np.log1p(errors / SCALE**2)
+
+
+def _distorted(rays: np.ndarray, distortion: float) -> np.ndarray:
+    """Return where (N, 3) rays are seen: the inverse of (x, y, 1 - distortion * r^2)."""
+    ahead, side = rays[:, 2:], np.linalg.norm(rays[:, :2], axis=1, keepdims=True) + 1e-12
+    root = np.sqrt(ahead**2 + 4 * distortion * side**2)
+    return np.asarray(rays[:, :2] * 2 / np.maximum(ahead + root, 1e-6))
