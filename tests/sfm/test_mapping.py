@@ -296,7 +296,7 @@ def test_a_fisheye_is_no_pinhole(pycolmap, lens, params, degrees) -> None:
             "OPENCV",
             [390.0, 390, 313, 244, -0.283, 0.074, 0.0002, 0.00002],
             48,
-        ),  # moves them by 20 %
+        ),
     ],
 )
 def test_distorting_lenses_stay_pinholes(pycolmap, lens, params, degrees) -> None:

@@ -27,9 +27,9 @@ MIN_DEVIATIONS = 6.0
 second 1.9. Fisheyes reach 5 to 30."""
 
 MIN_FLAT_DEVIATIONS, MIN_FLAT_RATIO, NEAR = 15.0, 2 / 3, 3.0
-"""Of a plane, or if the camera turned, a distorted homography fits better by this number of
-deviations, and fits at least this fraction of the matches that fit a pinhole's epipolar lines,
-within NEAR times `SCALE`. A curved cloth has 8 and 0.55, turning fisheyes have 20 to 70 and 0.7 to 0.9."""
+"""A distorted homography fits a plane, or a camera that turned, better by this number of deviations,
+and fits at least this fraction of the matches that fit a pinhole's epipolar lines, within NEAR
+times `SCALE`. A curved cloth has 8 and 0.55, fisheyes have 20 to 70 and 0.7 to 0.9."""
 
 UNDISTORT = "undistort them with the lens's calibration (cv2.undistort, cv2.fisheye)"
 

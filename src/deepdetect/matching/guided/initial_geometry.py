@@ -163,10 +163,10 @@ class InitialGeometry(TwoViewModel):
         points0, points1 = self.all_points
         agreeing = np.arange(len(points0)) < len(self.points0)
         sizes = grays[0].shape[::-1], grays[1].shape[::-1]
-        if bent := distortion(points0, points1, agreeing, sizes):
+        if distortion(points0, points1, agreeing, sizes):
             raise ImageError(
-                f"the lens of both images moves corners inwards by some {bent:.0%}, and no pinhole "
-                f"geometry fits: {UNDISTORT}"
+                "the lens of both images bends straight lines, as that of a fisheye, which no "
+                f"pinhole geometry fits: {UNDISTORT}"
             )
 
     def as_two_view_geometry(self) -> TwoViewGeometry:
