@@ -17,27 +17,22 @@ DISTORTIONS = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3)
 it shows 180 degrees in the corners. An equidistant fisheye of 120 degrees has 0.4, one of 150
 degrees 0.65. These are as dense as the fits can tell them apart."""
 
-MIN_DISTORTION = 0.2
-"""A lens with less distortion is no reason for an error: matches then miss epipolar lines by few
-pixels. It is 0.15 or less for photographs, and 0.2 for stereo cameras with k1 = -0.3."""
-
-MIN_DEVIATIONS = 6.0
-"""A lens fits better if the mean cost of the matches falls by this number of standard deviations
-(Vuong's test). The largest of 201 pairs by pinholes is 4.3, in a street with moving clouds, and the
-second 1.9. Fisheyes reach 5 to 30."""
+MIN_DISTORTION, MIN_DEVIATIONS = 0.2, 6.0
+"""A lens with less distortion is no reason for an error: matches miss epipolar lines by few pixels.
+It fits better if the mean cost of the matches falls by this number of standard deviations (Vuong's
+test). The most for 201 pairs by pinholes are 4.3, of a street, and 1.9; fisheyes reach 5 to 30."""
 
 MIN_FLAT_DEVIATIONS, MIN_FLAT_RATIO, NEAR = 15.0, 2 / 3, 3.0
-"""A distorted homography fits a plane, or a camera that turned, better by this number of deviations,
+"""A distorted homography fits a plane or a camera that turned better by this number of deviations,
 and fits at least this fraction of the matches that fit a pinhole's epipolar lines, within NEAR
 times `SCALE`. A curved cloth has 8 and 0.55, fisheyes have 20 to 70 and 0.7 to 0.9."""
 
 UNDISTORT = "undistort them with the lens's calibration (cv2.undistort, cv2.fisheye)"
 
 SCALE = 1e-3
-"""Scale of the Cauchy loss, in half diagonals: about one pixel of images with 1200 columns."""
-
 SCALES = SCALE * np.array([16.0, 8, 4, 2, 1, 1, 1, 1, 1])
-"""Scales of successive fits; wide scales first find a fit that is wrong at the border only."""
+"""Scales of the Cauchy loss of successive fits, in half diagonals: the last is about one pixel of
+images with 1200 columns. Wide scales first find a fit that is wrong at the border only."""
 
 
 def deviations(costs0: np.ndarray, costs1: np.ndarray) -> float:

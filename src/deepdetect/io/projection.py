@@ -32,7 +32,6 @@ first part ROUNDNESS of a circle (an octagon fills 0.90), or the second if two a
 diameter is from the shorter side to MAX_CUT times that (a video of full width). Chosen by hand."""
 
 VIEWS = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90 view.png"
-PHOTOGRAPHS = "give the photographs it is made of"
 
 
 def require_pinhole(
@@ -53,19 +52,18 @@ def require_pinhole(
     gray = np.zeros((1, 1), np.uint8) if rgb is None else luma(rgb)
     width, height = notes.get("size") or gray.shape[::-1]
     sphere = MIN_ASPECT * height <= width <= MAX_ASPECT * height
-    form, how = "e:flat", VIEWS
+    form, how = "e:flat", VIEWS if sphere else "give the photographs it is made of"
     if tags.get(Base.CustomRendered) == 6 or (projection and not sphere):  # 6: iPhones' panoramas
-        what, how = "part of a panorama by its metadata", PHOTOGRAPHS
+        what = "part of a panorama by its metadata"
     elif projection or edges_meet(gray):
         what = f"a full panorama ({'by its metadata' if projection else 'its edges meet'})"
-        how = VIEWS if sphere else PHOTOGRAPHS
     elif is_cube_map(gray):
         what, how = "a cube map", "give its six faces"
     elif "fisheye" in re.sub(r"[\W_]", "", lens.lower()) or (rim and is_round(gray)):
         what = "a fisheye picture (round, or by its EXIF)"
-        form = "fisheye:flat:ih_fov=180:iv_fov=180"
+        form, how = "fisheye:flat:ih_fov=180:iv_fov=180", VIEWS
     elif rim and all(is_round(half, 1) for half in np.array_split(gray, 2, axis=1)):
-        what, form = "two fisheye pictures side by side", "dfisheye:flat"
+        what, form, how = "two fisheye pictures side by side", "dfisheye:flat", VIEWS
     else:
         return
     name = file_name(image) if is_path(image) else name

@@ -154,8 +154,7 @@ class CameraIntrinsics:
     def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
         """Undistort an image, (H, W) or (H, W, 3), taken by this camera.
 
-        The result is the image of the camera `pinhole` (default: `self.pinhole`). The given image
-        may be a scaled copy of the photograph. Without distortion, only a crop changes it.
+        The result is that of `pinhole` (default: `self.pinhole`). The image may be a scaled copy.
         """
         if not self.distorts and (pinhole is None or pinhole.size == image.shape[1::-1]):
             return image
@@ -206,8 +205,8 @@ def initial_intrinsics(
 ) -> dict[str, CameraIntrinsics]:
     """Return the intrinsics of each image: those in `known`, or initial values to be refined.
 
-    An image not in `known` begins with the focal length `focal_px`, else that of EXIF, else a
-    guess. Images that share a camera (see `MultiViewOptions`) get the same object.
+    These have the focal length `focal_px`, else that of EXIF, else a guess. Images that share a
+    camera (see `MultiViewOptions`) get the same object.
     """
     begins = {}
     for name, size in sizes.items():
