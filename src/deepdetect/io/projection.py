@@ -52,9 +52,10 @@ def require_pinhole(
     gray = np.zeros((1, 1), np.uint8) if rgb is None else luma(rgb)
     width, height = notes.get("size") or gray.shape[::-1]
     sphere = MIN_ASPECT * height <= width <= MAX_ASPECT * height
-    form, how = "e:flat", VIEWS if sphere else "give the photographs it is made of"
+    photographs = "give the photographs it is made of"
+    form, how = "e:flat", VIEWS if sphere else photographs
     if tags.get(Base.CustomRendered) == 6 or (projection and not sphere):  # 6: iPhones' panoramas
-        what = "part of a panorama by its metadata"
+        what, how = "part of a panorama by its metadata", photographs
     elif projection or edges_meet(gray):
         what = f"a full panorama ({'by its metadata' if projection else 'its edges meet'})"
     elif is_cube_map(gray):
