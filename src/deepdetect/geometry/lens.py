@@ -20,12 +20,12 @@ degrees 0.65. These are as dense as the fits can tell them apart."""
 MIN_DISTORTION, MIN_DEVIATIONS = 0.2, 6.0
 """A lens with less distortion is no reason for an error: matches miss epipolar lines by few pixels.
 It fits better if the mean cost of the matches falls by this number of standard deviations (Vuong's
-test). The most for 201 pairs by pinholes are 4.3, of a street, and 1.9; fisheyes reach 5 to 30."""
+test). The most for 201 pairs by pinholes are 4.3, of a street, and 1.9; most fisheyes have 6 to 25."""
 
 MIN_FLAT_DEVIATIONS, MIN_FLAT_RATIO, NEAR = 15.0, 2 / 3, 3.0
 """A distorted homography fits a plane or a camera that turned better by this number of deviations,
 and fits at least this fraction of the matches that fit a pinhole's epipolar lines, within NEAR
-times `SCALE`. A curved cloth has 8 and 0.55, fisheyes have 20 to 70 and 0.7 to 0.9."""
+times `SCALE`. A curved cloth has 8 and 0.55; the fisheyes found have 20 to 70 and 0.7 to 0.9."""
 
 UNDISTORT = "undistort them with the lens's calibration (cv2.undistort, cv2.fisheye)"
 
