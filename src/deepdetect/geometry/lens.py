@@ -20,7 +20,7 @@ degrees 0.65. These are as dense as the fits can tell them apart."""
 MIN_DISTORTION, MIN_DEVIATIONS = 0.2, 6.0
 """A lens with less distortion is no reason for an error: matches miss epipolar lines by few pixels.
 It fits better if the mean cost of the matches falls by this number of standard deviations (Vuong's
-test). The most for 201 pairs by pinholes are 4.3, of a street, and 1.9; most fisheyes have 6 to 25."""
+test). The most for 201 pairs by pinholes are 4.3, of a street, and 1.9; fisheyes have up to 25."""
 
 MIN_FLAT_DEVIATIONS, MIN_FLAT_RATIO, NEAR = 15.0, 2 / 3, 3.0
 """A distorted homography fits a plane or a camera that turned better by this number of deviations,
