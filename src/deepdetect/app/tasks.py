@@ -19,7 +19,7 @@ from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.pictures import draw_all_matches
 from ..io.exif import calibration_from_exif
-from ..io.image import load_image
+from ..io.image import load_pixels
 from ..io.picture_file import save_picture
 from ..io.tables import save_keypoints, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_images
@@ -119,7 +119,7 @@ class Task:
 def run_match(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Match two images, guided by a geometry that is estimated first."""
     stages = _stages(GUIDED_STAGES, report)
-    first, second = (load_image(one.path) for one in images)
+    first, second = (load_pixels(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
     if not matches.success:
         raise DeepDetectError("no geometry can be trusted: both images must show the same scene")
@@ -159,7 +159,7 @@ def run_stitch(images: Images, options: Options, folder: Path, report: Report) -
     """Stitch a panorama."""
     stages = _stages(stages_of(len(images)), report)
     panorama = stitch([one.path for one in images], progress=stages)
-    save_picture(panorama.image, folder / "panorama.jpg")
+    save_picture(panorama.image, folder / "panorama.jpg", value_range=panorama.value_range)
     height, width = panorama.image.shape[:2]
     used = len(images) - len(panorama.unregistered)
     numbers = {
@@ -177,7 +177,7 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
     done = itertools.count(1)
     report("starting", 0, MODEL_STAGES)
     left, right = (one.path for one in images)
-    sizes = [load_image(path).shape[1::-1] for path in (left, right)]
+    sizes = [load_pixels(path).shape[1::-1] for path in (left, right)]
     focal_px, assumed = options.get("focal_px"), False
     if focal_px is None:
         try:
@@ -237,7 +237,7 @@ def run_folder_keypoints(
         for number, one in enumerate(images):
             report(one.name, number, len(images))
             try:
-                rgb = load_image(one.path)
+                rgb = load_pixels(one.path)
             except DeepDetectError as error:
                 failures.append(str(error).replace(str(one.path), one.name))
                 continue

@@ -31,7 +31,7 @@ from .._shared.errors import (
     first_line,
 )
 from .._shared.options import shown, suggest_keywords, whole
-from .._shared.value_range import range_of_call
+from .._shared.value_range import ValueRange
 
 FORMATS = {
     "JPEG": ".jpg .jpeg .jpe .jfif .jfi .jif .mpo .jps .insp",
@@ -103,15 +103,16 @@ YUV4MPEG, MP4 and MOV, and of MPEG transport streams, whose packets have 188 or 
 class ReadingOptions:
     """How image files are read; the fields other than the last are parameters of `load_image`.
 
-    `deep_range` is the range of uint16 images that state none, common to the images of a call.
+    `deep_range` is the range of uint16 images that state none, common to the images of a call. While
+    it is looked for, it is an array of the counts of their values.
     """
 
     max_megapixels: float = MAX_MEGAPIXELS
-    value_range: tuple[float, float] | None = None
+    value_range: ValueRange | None = None
     bands: tuple[int, int, int] | None = None
     page: int | None = None
     allow_truncated: bool = False
-    deep_range: tuple[float, float] | None = None
+    deep_range: ValueRange | np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not (isinstance(self.max_megapixels, Real) and self.max_megapixels > 0):
@@ -161,8 +162,7 @@ def read_with(options: ReadingOptions) -> Iterator[None]:
     """
     token = _reading.set(options)
     try:
-        with range_of_call(options.deep_range):
-            yield
+        yield
     finally:
         _reading.reset(token)
 

@@ -166,9 +166,8 @@ def _to_pixels(
 
         rgb = np.array(Image.fromarray(np.ascontiguousarray(chosen), "CMYK").convert("RGB"))
     else:
-        rgb = array_to_pixels(
-            chosen, name=name, value_range=options.value_range, white=_white(page), deep=deep
-        )
+        how = {"white": _white(page), "call": options.deep_range, "deep": deep}
+        rgb = array_to_pixels(chosen, name=name, value_range=options.value_range, **how)
     if photometric == MIN_IS_WHITE:
         rgb = ~rgb
     alpha, opaque = ~absent.any(axis=2), 1
