@@ -56,7 +56,9 @@ def test_photographs_of_16_bits_have_one_range(photo: np.ndarray, tmp_path: Path
     for name, factor in {"dark.png": 4, "light.png": 16}.items():
         Image.fromarray(gray * factor).save(tmp_path / name)
     points = PointDetector(50).detect(photo)
-    found = describe_collection(Collection(dict.fromkeys(["dark.png", "light.png"], points), {}, tmp_path))
+    found = describe_collection(
+        Collection(dict.fromkeys(["dark.png", "light.png"], points), {}, tmp_path)
+    )
     dark = np.rint(gray * 4 * (255 / 4095)).astype(np.uint8)
     expected = describe_keypoints(dark, points).descriptors
     np.testing.assert_array_equal(found.keypoints["dark.png"].descriptors, expected)

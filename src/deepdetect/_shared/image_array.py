@@ -55,15 +55,16 @@ def array_to_pixels(
     value_range: Sequence[float] | None = None,
     bands: Sequence[int] | None = None,
     white: int | None = None,
-    call: ValueRange | np.ndarray | None = None,
+    call: ValueRange | None = None,
+    counts: np.ndarray | None = None,
     deep: bool = False,
 ) -> np.ndarray:
     """Convert an array or PyTorch tensor to an (H, W, 3) RGB image, or (H, W, 4) as in `alpha`.
 
     The result is uint8 or, if `deep` is set and the input has more than 8 bits, uint16. `white` is
     the value of white in an unsigned image, if known. `call` is the range of the uint16 images of a
-    call that state no white, or an array to which the counts of their values are added. `name` is
-    the image's name in messages. The other arguments are as in `load_image`.
+    call that state no white; `counts`, to which their values are added, serves to find it. `name`
+    is the image's name in messages. The other arguments are as in `load_image`.
 
     Raises:
         ImageError: the image has an unsupported shape, type or range, or contains NaN.
@@ -77,10 +78,8 @@ def array_to_pixels(
     if array.dtype.kind not in "buif":
         raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
     colours = array[:, :, :3] if array.ndim == 3 else array
-    if isinstance(call, np.ndarray):
-        if array.dtype == np.uint16 and white is None:
-            call += counts_of(colours)
-        call = None
+    if counts is not None and array.dtype == np.uint16 and white is None:
+        counts += counts_of(colours)
     if value_range is None:
         value_range = _range_of(colours, name, white, call)
     values = _in_range(array, value_range, name, deep)

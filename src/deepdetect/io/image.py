@@ -182,7 +182,7 @@ def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOption
     seen = [each for each in images if _may_be_deep(each)] if options.deep_range is None else []
     for image in seen[:: -(-len(seen) // SEEN_IMAGES) or 1]:
         with suppress(Exception), warnings.catch_warnings(action="ignore"):
-            _load(image, channels, replace(options, deep_range=counts))
+            _load(image, channels, replace(options, counts=counts))
         if not counts.any():
             break
     if counts.any():
@@ -202,7 +202,7 @@ def _may_be_deep(image: Any) -> bool:
     return not is_file(image) and getattr(image, "dtype", None) != np.uint8
 
 
-def _stated_bits(start: bytes) -> int:
+def _stated_bits(start: bytes | bytearray) -> int:
     """Return the bits per channel that the beginning of a PNG or JPEG 2000 file states, or 0."""
     header = start.find(b"ihdr")  # ISO/IEC 15444-1, I.5.3.1, and A.5.1 for a bare codestream
     if start[:4] == PNG_SIGNATURE[:4]:
@@ -232,7 +232,7 @@ def _load(
     elif raw and isinstance(image, np.ndarray) and image.ndim in (2, 3):
         rgb = image.reshape(*image.shape[:2], -1)
     else:
-        rgb = array_to_pixels(image, channels, call=options.deep_range, deep=deep, **for_arrays)
+        rgb = array_to_pixels(image, channels, deep=deep, **options.common, **for_arrays)
     height, width = rgb.shape[:2]
     if min(height, width) < MINIMUM_SIDE:
         raise ImageError(
@@ -292,18 +292,6 @@ def ignore_masks(ignore: Any, images: int) -> list[Any]:
 def luma(rgb: np.ndarray) -> np.ndarray:
     """Return the 8-bit luma (ITU-R BT.601) of a uint8 image of 3 or 4 channels, (H, W) uint8."""
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY if rgb.shape[2] == 3 else cv2.COLOR_RGBA2GRAY)
-
-
-def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
-    """Scale an image so that its shorter side has the given length in pixels."""
-    height, width = rgb.shape[:2]
-    factor = short_side / min(height, width)
-    if factor == 1:
-        return rgb
-    size = (max(round(width * factor), short_side), max(round(height * factor), short_side))
-    # Area averaging does not alias when shrinking; cubic keeps edges when enlarging.
-    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
-    return cv2.resize(rgb, size, interpolation=method)
 
 
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
@@ -408,8 +396,8 @@ def _by_opencv(
     if values is None:
         raise damaged_image(name, "it cannot be decoded")
     value_range = ALL_VALUES if raw else options.value_range
-    how = {"value_range": value_range, "call": options.deep_range, "deep": deep}
-    return array_to_pixels(values, "bgr", name, **how)
+    common = options.common
+    return array_to_pixels(values, "bgr", name, value_range=value_range, deep=deep, **common)
 
 
 def orientation_of(image: Any) -> Any:
@@ -420,9 +408,7 @@ def orientation_of(image: Any) -> Any:
         return 1
 
 
-def _from_pil(
-    image: Any, name: str, options: ReadingOptions, deep: bool, raw: bool
-) -> np.ndarray:
+def _from_pil(image: Any, name: str, options: ReadingOptions, deep: bool, raw: bool) -> np.ndarray:
     value_range = options.value_range
     try:
         image.load()
@@ -433,8 +419,8 @@ def _from_pil(
         white = 65535 if image.format == "PPM" else None  # Pillow scales white to this in PPM
         if raw and values.dtype == np.uint16:
             value_range = ALL_VALUES
-        how = {"value_range": value_range, "white": white, "call": options.deep_range}
-        rgb = array_to_pixels(values, name=name, deep=deep, **how)
+        how = {"value_range": value_range, "white": white, "deep": deep, **options.common}
+        rgb = array_to_pixels(values, name=name, **how)
         clear = image.info.get("transparency")
         return rgb if clear is None else on_grey(rgb, values != clear, 1, name)
     width, height = image.size

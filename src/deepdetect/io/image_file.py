@@ -101,10 +101,10 @@ YUV4MPEG, MP4 and MOV, and of MPEG transport streams, whose packets have 188 or 
 @suggest_keywords
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How image files are read; the fields other than the last are parameters of `load_image`.
+    """How image files are read; the fields other than the last two are parameters of `load_image`.
 
-    `deep_range` is the range of uint16 images that state none, common to the images of a call. While
-    it is looked for, it is an array of the counts of their values.
+    `deep_range` is the range of uint16 images that state none, common to the images of a call.
+    While it is looked for, the values of these images are added up in `counts`.
     """
 
     max_megapixels: float = MAX_MEGAPIXELS
@@ -112,7 +112,8 @@ class ReadingOptions:
     bands: tuple[int, int, int] | None = None
     page: int | None = None
     allow_truncated: bool = False
-    deep_range: ValueRange | np.ndarray | None = None
+    deep_range: ValueRange | None = None
+    counts: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not (isinstance(self.max_megapixels, Real) and self.max_megapixels > 0):
@@ -133,6 +134,11 @@ class ReadingOptions:
                 )
                 raise OptionError(f"`{name}` must be {what}, not {shown(value)}")
             object.__setattr__(self, name, numbers or None)
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What `array_to_pixels` needs to know about the other images of the call."""
+        return {"call": self.deep_range, "counts": self.counts}
 
     @property
     def settings(self) -> dict[str, Any]:

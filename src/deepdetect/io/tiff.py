@@ -183,7 +183,7 @@ def _to_pixels(
 
         rgb = np.array(Image.fromarray(np.ascontiguousarray(chosen), "CMYK").convert("RGB"))
     else:
-        how = {"white": _white(page), "call": options.deep_range, "deep": deep}
+        how = {"white": _white(page), "deep": deep, **options.common}
         rgb = array_to_pixels(chosen, name=name, value_range=options.value_range, **how)
     if photometric == MIN_IS_WHITE:
         rgb = ~rgb
