@@ -5,6 +5,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from natsort import natsorted, ns
@@ -235,6 +236,16 @@ BAD_ARRAYS = {
 def test_bad_arrays(kind: str) -> None:
     with pytest.raises(ImageError):
         load_image(BAD_ARRAYS[kind])
+
+
+@pytest.mark.parametrize("bits", [12, 16])
+def test_colours_of_16_bits_in_jpeg_2000(bits: int) -> None:
+    values = np.random.default_rng(0).integers(0, 1 << bits, (40, 50, 3)).astype(np.uint16)
+    done, content = cv2.imencode(".jp2", values, [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, 1000])
+    assert done
+    rgb = load_image(content.tobytes())
+    expected = values[..., ::-1] * (255 / (2**bits - 1))
+    assert np.abs(rgb - expected).max() < 4
 
 
 def test_luma_is_bt601(photo: np.ndarray) -> None:
