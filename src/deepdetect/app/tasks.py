@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -267,9 +268,8 @@ def _entry_name(name: str, others: Sequence[str]) -> str:
         >>> _entry_name("a/b.jpg", []), _entry_name("../b", ["b.csv"])
         ('b.csv', 'b_2.csv')
     """
-    stem = Path(name.replace("\\", "/")).stem
-    stem = "".join(c if c.isalnum() or c in "-_ " else "_" for c in stem) or "image"
-    names = (f"{stem}{end}.csv" for end in ("", *(f"_{k}" for k in range(2, len(others) + 3))))
+    stem = re.sub(r"[^\w -]", "_", Path(name.replace("\\", "/")).stem) or "image"
+    names = itertools.chain([f"{stem}.csv"], (f"{stem}_{k}.csv" for k in itertools.count(2)))
     return next(name for name in names if name not in others)
 
 

@@ -120,18 +120,15 @@ class ReadingOptions:
             raise OptionError(f"`max_megapixels` must be above 0, not {self.max_megapixels}")
         if self.page is not None:
             whole("page", self.page)
-        for name, count in (("bands", 3), ("value_range", 2)):
+        for name, count, kind, what in (
+            ("bands", 3, Integral, "3 numbers from 1 on"),
+            ("value_range", 2, Real, "2 numbers, black and a larger white"),
+        ):
             value = getattr(self, name)
             numbers: tuple[Any, ...] = tuple(value) if np.iterable(value) else ()
-            fits = len(numbers) == count and all(isinstance(each, Real) for each in numbers)
-            if fits and name == "bands":
-                fits = all(isinstance(each, Integral) and each > 0 for each in numbers)
-            elif fits:
-                fits = bool(0 < numbers[1] - numbers[0] < math.inf)
-            if not (fits or value is None):
-                what = (
-                    "3 numbers from 1 on" if count == 3 else "2 numbers, black and a larger white"
-                )
+            fits = len(numbers) == count and all(isinstance(each, kind) for each in numbers)
+            least = numbers[1] - numbers[0] if fits and count == 2 else min(numbers, default=0)
+            if value is not None and not (fits and 0 < least < math.inf):
                 raise OptionError(f"`{name}` must be {what}, not {shown(value)}")
             object.__setattr__(self, name, numbers or None)
 

@@ -114,13 +114,11 @@ def whole_pages(stored: list[Any]) -> list[Any]:
 def _mask_of(stored: list[Any], page: Any) -> np.ndarray | None:
     """Return GDAL's mask of a page, (H, W) bool: it follows the page, as its thumbnails do."""
     after = stored[stored.index(page) + 1 :] if page in stored else []
-    for each in takewhile(lambda other: other.is_mask or other.is_reduced, after):
-        if each.is_mask and (each.imagewidth, each.imagelength) == (
-            page.imagewidth,
-            page.imagelength,
-        ):
-            return np.asarray(each.asarray() != 0)
-    return None
+    others = takewhile(lambda each: each.is_mask or each.is_reduced, after)
+    size = page.imagewidth, page.imagelength
+    masks = (each for each in others if each.is_mask)
+    found = next((each for each in masks if (each.imagewidth, each.imagelength) == size), None)
+    return None if found is None else np.asarray(found.asarray() != 0)
 
 
 def page_numbers(source: Any) -> list[int]:
