@@ -1,4 +1,4 @@
-"""Readers of camera files of SLAM programs, devices and photogrammetry, and what all readers share.
+"""Formats of camera files: readers of the parsed files, and what all readers share.
 
 A reader takes the parsed file and the (width, height) of the image, if it is known, and returns the
 cameras as objects with names that `view_of` knows, or None for a file of another format.
@@ -22,6 +22,10 @@ Pair = tuple[int, int] | None
 MM_PER_M = 1000.0
 MM_PER_CM = 10.0
 
+METRES_BELOW, MM_FROM = 1.0, 30.0
+"""A baseline without a unit is in metres below the first number, and in mm from the second on. What
+lies between may also be in cm, or in squares of a chessboard, which OpenCV's example counts."""
+
 ROUNDING = 1e-9
 """Distortion coefficients up to this are zeros with rounding errors, because even at the corner of
 a large image they would move a pixel by less than a ten-thousandth."""
@@ -30,11 +34,9 @@ MIN_FOCAL = 0.1
 """A focal length under this fraction of the longer side of the image is refused as one in another
 unit, because in pixels it would mean a pinhole camera with a field of view above 157 degrees."""
 
-MATRICES = (
-    *("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "M1", "K1", "cameraMatrix1"),
-    *("intrinsicMatrix", "intrinsic_matrix", "IntrinsicMatrix", "intrinsic", "intrinsics", "cam_K"),
-    "matrix",
-)
+MATRIX = r"(?:new|color|rgb|cam(?:era)?)*(?:intrinsics?)?(?:matrix|mtx)|intrinsics?|[km]"
+PROJECTION = r"p|projection(?:matrix)?"
+SIDES = ("left", "right"), ("l", "r"), ("1", "2"), ("0", "1")
 FOCAL_LENGTHS = (
     *(("fx", "fy"), ("flx", "fly"), ("focalx", "focaly"), ("focallengthx", "focallengthy")),
     *(("focallength",), ("focal",), ("f",)),
@@ -42,21 +44,28 @@ FOCAL_LENGTHS = (
 CENTRES = ("cx", "cy"), ("ppx", "ppy"), ("principalpoint",)
 SIZES = (
     *(("width", "height"), ("w", "h"), ("cols", "rows"), ("imagewidth", "imageheight")),
-    ("resolution",),
+    *(("resolution",), ("imagedimension",)),
 )
-"""Names of values in other programs; the last three in lower case and without underscores."""
+"""Names of values in other programs, as `short` returns them."""
+SIZE_NAMES = {name for names in SIZES for name in names}
 
-MODELS = re.compile(r"(camera|distortion)?_?(model|type)|model_type|projection(_type)?|poly.*_name")
+MODELS = re.compile(r"(distortion)?(model|type)|modeltype|projection(type)?|poly.*name")
 NO_PINHOLES = re.compile(
     r"fisheye|equi|spheric|cylind|omni|kannala|theta|panoram|unified|eucm|double|dual|division|"
-    r"orthogr|\b(ds|mei|fov|rpc)\b",
+    r"atan|orthogr|\b(ds|mei|fov|rpc)\b",
     re.IGNORECASE,
 )
 """Camera models with one of these words in their name are refused, even without distortion."""
 
 DISTORTIONS = re.compile(
-    r".*(distortion|disto_|dist_?coef).*|dist|coeffs?|coefficients|[kps]\d|b2|skew|d\d?|xi|omega"
+    r"(?!num).*(distortion|disto[^r]|distcoef).*|dist|coeffs?|coefficients|[kpsd]\d|b2|skew|d|kc|xi|"
+    "omega"
 )
+CROPS = re.compile(r"[xy]_offset|binning_[xy]")
+BASELINES = re.compile(
+    r"(?:stereo)?baseline(?:in)?(?:(mm|millimet\w+)|(cm|centimet\w+)|(m|met\w+))?"
+)
+"""Names of distortion, of a part of the sensor, and of a baseline in mm, cm, metres or no unit."""
 
 ZED_SIZES = {
     **{"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200)},
@@ -76,38 +85,66 @@ class Found(NamedTuple):
 class Format(NamedTuple):
     """A format: whose file it is, a pattern that one of its keys has, and its reader.
 
-    `first` is the x and y of the centre of the first pixel; None means 0, but 1 for a transposed
-    matrix. Principal points begin in the "corner" or in the "middle" of the image; "fractions" are
-    of its longer side, from the middle.
+    `first` is the x and y of the centre of the first pixel; None means 0, but 1 for MATLAB's
+    matrix. Principal points may also begin in the "middle"; "fractions" are of the longer side of
+    the image, from its middle.
     """
 
     name: str
     key: str
     read: Callable[[Values, Pair], Found | None]
-    first: float | None = None
-    origin: Literal["corner", "middle", "fractions"] = "corner"
+    first: float | None | Literal["middle", "fractions"] = None
+
+
+def short(key: Any) -> str:
+    """Return a name in lower case without blanks, underscores, and the word camera before others."""
+    return re.sub(r"[_ ]|^cam(era)?[_ ]?(?=[a-z])(?!era)", "", str(key).lower())
 
 
 def numbers_in(value: Any) -> list[float]:
-    """Return the numbers of nested lists and objects, also those in text, but no booleans."""
+    """Return the numbers of nested lists, objects and text; none for booleans and other text."""
+    if isinstance(value, bytes) or (isinstance(value, str) and value.startswith("$base64$")):
+        raise ReconstructionError("it has its numbers in base64: write it without base64")
+    if isinstance(value, str):
+        value = re.split(r"[\s,;\[\]]+", value.strip(" \t\r\n[];,"))
+        try:
+            return [float(word) for word in value]
+        except ValueError:
+            return []
     if isinstance(value, Mapping):
         value = value["data"] if "data" in value else [*value.values()]
     if isinstance(value, list | tuple | np.ndarray):
         return [number for each in value for number in numbers_in(each)]
-    try:
-        return [] if value is None or isinstance(value, bool) else [float(value)]
-    except (TypeError, ValueError):
-        return []
+    return [] if value is None or isinstance(value, bool) else [float(value)]
 
 
-def matrix_at(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | None:
-    """Return the first value at `keys` whose size is in `sizes`, as three rows, or else None."""
-    for key in keys:
-        value = values.get(key)
-        data = value.get("data") if isinstance(value, Mapping) else value
-        if data is not None and np.size(data) in sizes and not isinstance(data[0], Mapping):
-            return np.array(data, np.float64).reshape(3, -1)
-    return None
+def number_at(values: Values, key: str) -> float:
+    """Return the number at a key that must be there."""
+    return numbers_in(values[key])[0]
+
+
+def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
+    """Return a list, text or OpenCV's matrix of one of the sizes as three rows, or else None."""
+    nested = value[0] if isinstance(value, list) and value else value
+    if isinstance(nested, Mapping) and "data" not in nested:
+        return None
+    numbers = numbers_in(value)
+    if len(numbers) not in sizes:
+        return None
+    rows = np.reshape(numbers, (-1, 3 if len(numbers) == 9 else 4))[:3]
+    by_columns = not isinstance(nested, list) and not rows[:2, 2].any() and rows[2, :2].any()
+    return rows.T if by_columns else rows
+
+
+def matrices(values: Values, name: str, *sizes: int) -> list[np.ndarray]:
+    """Return the matrices of the left and the right camera, by their keys, or the first one."""
+    found: dict[str, np.ndarray] = {}
+    for key, value in values.items():
+        match = re.fullmatch(rf"(left|right|l|r)?({name})(left|right|l|r|[012])?", short(key))
+        if match and (matrix := matrix_of(value, *sizes)) is not None:
+            found.setdefault(match[1] or match[3] or "", matrix)
+    pairs = ([found[left], found[right]] for left, right in SIDES if {left, right} <= {*found})
+    return next(pairs, [*found.values()][:1])
 
 
 def objects_in(values: Any, name: str = "") -> Iterator[tuple[str, Values]]:
@@ -120,15 +157,39 @@ def objects_in(values: Any, name: str = "") -> Iterator[tuple[str, Values]]:
             yield from objects_in(value, f"{name} {key}".lower())
 
 
+def in_mm(length: float, unit: float | None = None) -> float | None:
+    """Return a length in mm by its unit in mm, if that is known, else by its size; None for 0."""
+    if unit is None:
+        unit = MM_PER_M if length < METRES_BELOW else float(length >= MM_FROM)
+        if not unit:
+            warnings.warn(
+                f"the baseline {length:g} has no unit and may be in mm or cm, so it is left out and "
+                'lengths are in baselines: call it "baseline_mm", and give it in mm',
+                stacklevel=2,
+            )
+    return length * unit or None
+
+
+def apart(left: np.ndarray, right: np.ndarray) -> float:
+    """Return the distance between two cameras by their projection matrices."""
+    distance = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
+    if distance < 0:
+        raise ReconstructionError("it has its second camera to the left of its first: swap the two")
+    return distance
+
+
 def check_pinhole(values: Values) -> None:
     """Raise an error if one of the values says that the camera is no pinhole without distortion."""
     for key, value in values.items():
-        name, numbers = str(key).lower(), numbers_in(value)
+        name = short(key)
         words = value.replace("_", " ") if isinstance(value, str) else ""
         if (MODELS.fullmatch(name) and NO_PINHOLES.search(words)) or ("fisheye" in name and value):
             raise ReconstructionError(
                 f"it has a camera that is no pinhole ({key} {value!r}): undistort the images"
             )
+        if not DISTORTIONS.fullmatch(name):
+            continue
+        numbers = numbers_in(value)
         name = name if len(numbers) == 1 else name.rstrip("0123456789")  # K1 may be a matrix
         if DISTORTIONS.fullmatch(name) and not all(abs(number) <= ROUNDING for number in numbers):
             raise ReconstructionError(
@@ -148,7 +209,7 @@ def _pair_at(values: Values, choices: Iterable[tuple[str, ...]]) -> list[float]:
     return []
 
 
-def _of_matrix(matrix: np.ndarray, first: float | None) -> tuple[list[float], list[float], float]:
+def _of_matrix(matrix: np.ndarray, first: Any) -> tuple[list[float], list[float], Any]:
     """Return focal lengths, principal point, and the x and y of the centre of the first pixel."""
     left, last = matrix[:, :3], (0, 0, 1)
     if not np.allclose(left[2], last) and np.allclose(left[:, 2], last):
@@ -169,7 +230,7 @@ def _of_matrix(matrix: np.ndarray, first: float | None) -> tuple[list[float], li
     skew = float(left[0, 1])
     check_pinhole({"skew": skew if abs(skew) > ROUNDING * abs(left[0, 0]) else 0})
     (fx, _, cx), (_, fy, cy) = left[:2].tolist()
-    return [fx, fy], [cx, cy], first or 0.0
+    return [fx, fy], [cx, cy], first
 
 
 def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
@@ -177,25 +238,25 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
 
     If the object describes no camera, None is returned.
     """
-    own = {re.sub("[_ ]", "", str(key)).lower(): value for key, value in values.items()}
+    own = {short(key): value for key, value in values.items()}
     size, first, centre = _pair_at(own, SIZES), form.first, _pair_at(own, CENTRES)
-    focal = _pair_at(own, FOCAL_LENGTHS)
-    if (matrix := matrix_at(values, MATRICES, 9, 12)) is not None:
+    focal, line = _pair_at(own, FOCAL_LENGTHS), own.get("intrinsics")
+    matrix = next(iter(matrices(values, MATRIX, 9, 12, 16)), None)
+    if matrix is not None:
         focal, centre, first = _of_matrix(matrix, first)
-    elif np.shape(line := own.get("intrinsics", ())) == (4,):  # fx, fy, cx, cy, as Kalibr has them
+    elif matrix_of(line, 4) is not None:  # fx, fy, cx, cy, as Kalibr has them
         focal, centre = numbers_in(line)[:2], numbers_in(line)[2:]
-    if form.origin == "corner" and not (focal and centre):
+    corner = not isinstance(first, str)
+    if corner and not (focal and centre):
         if not centre and not {"fx", "flx", "focalx"} & {*own}:
             return None
         missing = "principal point (cx, cy)" if focal else "focal length (fx, fy)"
         raise ReconstructionError(f"it has no {missing}: add it in pixels")
     check_pinhole(values)
     sides = np.array(size or image or (1, 1), np.float64)
-    if form.origin != "corner":
-        unit = sides.max() if form.origin == "fractions" else 1.0
-        focal = [unit * number for number in focal]
-        centre = (unit * np.array(centre or (0, 0)) + (sides - 1) / 2).tolist()
-    x, y = (number - (first or 0) for number in centre)
+    unit = sides.max() if first == "fractions" else 1.0
+    focal = [unit * number for number in focal]
+    x, y = unit * np.array(centre or (0, 0)) - ((1 - sides) / 2 if not corner else first or 0)
     if not focal or min(focal) <= 0 or not math.isfinite(sum(focal)):
         raise ReconstructionError(f"it has no focal length above 0, but {focal}: correct it")
     rectified = matrix is not None and matrix.shape[1] == 4  # the centre may lie outside the image
@@ -212,22 +273,164 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
             stacklevel=2,
         )
     shape = dict(zip(("width", "height"), map(int, size), strict=False))
-    return {"focal_px": focal, "cx": x, "cy": y, **shape}
+    return {"focal_px": focal, "cx": float(x), "cy": float(y), **shape}
 
 
-def plain(values: Values, image: Pair) -> Found | None:
+def plain(values: Values, image: Pair = None) -> Found | None:
     """Read any file that has cameras in the usual names; left and right by their names."""
-    found, probe = [], ANY._replace(first=0.0)
+    found, length = [], None
     for name, each in objects_in(values):
         check_pinhole(each)
-        found += [(name, each)] if view_of(each, None, probe) else []
+        found += [(name, each)] if view_of(each, None, ANY._replace(first=0.0)) else []
+        for key, value in each.items():
+            match = BASELINES.fullmatch(short(key))
+            if match and len(number := numbers_in(value)) == 1:
+                unit = next(
+                    (u for u, word in zip(UNITS, match.groups(), strict=True) if word), None
+                )
+                length = in_mm(abs(number[0]), unit)
+    cameras = [each for _, each in found]
     sides = [[each for name, each in found if side in name] for side in ("left", "right")]
     stereo = [len(side) for side in sides] == [1, 1]
-    cameras = sides[0] + sides[1] if stereo else [each for _, each in found]
-    return Found(cameras, stereo) if found else None
+    cameras = sides[0] + sides[1] if stereo else cameras
+    length = length or (distance(*cameras) if len(cameras) == 2 else None)
+    return Found(cameras, stereo or bool(length and len(cameras) <= 2), length) if found else None
 
 
+UNITS = 1.0, MM_PER_CM, MM_PER_M
 ANY = Format("the file", ".*", plain)
+
+
+def distance(first: Values, second: Values) -> float | None:
+    """Return the baseline in mm from two poses (EuRoC, OKVIS) or two projection matrices (ROS)."""
+    for key in ("T_BS", "T_SC"):
+        if key in first and key in second:
+            left, right = (np.array(numbers_in(each[key]))[3:12:4] for each in (first, second))
+            return in_mm(float(np.linalg.norm(left - right)), MM_PER_M)
+    both = [matrices(each, PROJECTION, 12) for each in (first, second)]
+    return in_mm(apart(*(each[0] for each in both)), MM_PER_M) if all(both) else None
+
+
+def colmap(values: Values, image: Pair) -> Found:
+    """Read the lines of COLMAP's cameras.txt."""
+    cameras = []
+    for model, numbers in values["COLMAP"]:
+        width, height, *params = numbers_in(numbers)
+        if model.startswith(("SIMPLE_", "RADIAL")):  # these models have a single focal length
+            params.insert(0, params[0])
+        size = {"model": model, "width": width, "height": height}
+        cameras.append({**size, "intrinsics": params[:4], "coefficients": params[4:]})
+    return Found(cameras, len(cameras) == 2)
+
+
+def dso(values: Values, image: Pair) -> Found:
+    """Read camera.txt of DSO and LSD-SLAM; numbers under 1 are fractions of width and height."""
+    model, numbers, size = values["DSO"]
+    size = np.array(numbers_in(size))
+    fx, fy, cx, cy, *more = numbers_in(numbers)
+    if cx < 1 and cy < 1:
+        fx, fy, cx, cy = np.array([fx, fy, cx, cy]) * (*size, *size) - (0, 0, 0.5, 0.5)
+    more = {"model": model, "coefficients": more, "resolution": size}
+    return Found([{"intrinsics": [fx, fy, cx, cy], **more}])
+
+
+def kitti(values: Values, image: Pair) -> Found | None:
+    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw), by default 2 and 3."""
+    found = {
+        int(key[-1]): matrix
+        for key, value in values.items()
+        if re.fullmatch(r"P\d|P_rect_\d+", str(key))
+        and (matrix := matrix_of(value, 12)) is not None
+    }
+    if not {0, 3} & {*found} and "P_rect_02" not in values:
+        return None  # OpenCV's files have P1 and P2
+    wanted = values.get("KITTI's views")
+    only = next(iter(found))
+    pairs = (each for each in (wanted, (2, 3), (0, 1)) if each and {*each} <= {*found})
+    first, second = next(pairs, (only, only))
+    if wanted and wanted != (first, second):
+        warnings.warn(
+            f"the calibration lacks the cameras {wanted[0]} and {wanted[1]} or one of them, which "
+            f"the images are from: its cameras {first} and {second} are taken instead",
+            stacklevel=2,
+        )
+    size = {"resolution": values.get(f"S_rect_0{first}")}
+    length = in_mm(apart(found[first], found[second]), MM_PER_M)
+    return Found([{**size, "K": found[number]} for number in (first, second)], True, length)
+
+
+def middlebury(values: Values, image: Pair) -> Found | None:
+    """Read Middlebury's calib.txt."""
+    both = matrices(values, "cam", 9)
+    if len(both) < 2:
+        return None
+    both[1][0, 2] = both[0][0, 2] + sum(numbers_in(values.get("doffs"))) or both[1][0, 2]
+    size = {key: values.get(key) for key in ("width", "height")}
+    length = sum(numbers_in(values.get("baseline")))
+    return Found([{**size, "K": each} for each in both], True, in_mm(length, 1.0))
+
+
+def kalibr(values: Values, image: Pair) -> Found | None:
+    """Read a camera chain of Kalibr, or a file with one camera, such as EuRoC's sensor.yaml."""
+    found = [each for key in ("cam0", "cam1") if isinstance(each := values.get(key), Mapping)]
+    cameras = found or [values]
+    if not all({"camera_model", "intrinsics"} <= {*camera} for camera in cameras):
+        return None
+    length = math.hypot(*numbers_in(cameras[-1].get("T_cn_cnm1"))[3:12:4])
+    return Found(cameras, True, in_mm(length, MM_PER_M))
+
+
+def check_whole(values: Values) -> None:
+    """Raise an error if ROS's values say that the images are a part or a smaller copy of others."""
+    for _, each in objects_in(values):
+        for key, value in each.items():
+            numbers = numbers_in(value) if CROPS.fullmatch(str(key)) else []
+            if numbers and numbers[0] > str(key).startswith("binning"):  # 0 and 1: no binning
+                raise ReconstructionError(
+                    f"it is for a part or a smaller copy of the camera's images ({key} "
+                    f"{numbers[0]:g}): give the calibration of these images"
+                )
+
+
+def ros(values: Values, image: Pair) -> Found | None:
+    """Read ROS's camera_info or ost.txt: the projection matrices, which are of rectified images."""
+    shared = values["image"] if isinstance(values.get("image"), Mapping) else {}
+    found, cameras = [], []
+    check_whole(values)
+    for _, each in objects_in(values):
+        both = matrices(each, PROJECTION, 12), matrices(each, MATRIX, 9)
+        if [len(some) for some in both] == [1, 1] and both[0][0][0, 0] > 0:
+            found.append(each)
+            size = {key: n for key, n in {**shared, **each}.items() if short(key) in SIZE_NAMES}
+            cameras.append({**size, "K": both[0][0]})
+    if len(found) == 1:
+        try:
+            check_pinhole(found[0])
+        except ReconstructionError:
+            warnings.warn(
+                "the calibration has distortion, and the projection matrix that is read is of the "
+                "images without it: give the rectified images (image_rect)",
+                stacklevel=2,
+            )
+    length = distance(*found) if len(found) == 2 else None
+    return Found(cameras, len(found) == 2, length) if found else None
+
+
+def opencv(values: Values, image: Pair) -> Found | None:
+    """Read a file of OpenCV. If it has distortion, it also needs rectified projections."""
+    found, length = matrices(values, PROJECTION, 12), 0.0
+    if len(found) == 2:
+        length = apart(*found)
+    else:
+        found = matrices(values, MATRIX, 9, 12)
+        for _, each in objects_in(values) if found else ():
+            check_pinhole(each)
+        if len(found) == 2:
+            length = math.hypot(*numbers_in(values.get("T")))
+    if len(found) < 2:
+        return Found([values]) if found else None
+    size = {key: number for key, number in values.items() if short(key) in SIZE_NAMES}
+    return Found([{**size, "K": matrix} for matrix in found], True, in_mm(length))
 
 
 def openmvg(values: Values, image: Pair) -> Found | None:
@@ -243,6 +446,8 @@ def orb_slam(values: Values, image: Pair) -> Found | None:
     check_pinhole(shared)
     found = [{**shared, **values[key]} for key in ("Camera1", "Camera2") if key in values]
     found, stereo = found or [dict(shared)], values.get("Stereo", {})
+    if not {"fx", "type", "model", "bf"} & {*found[0]}:
+        return None
     metres = float(shared.get("bf", shared.get("focal_x_baseline", 0))) / float(found[0]["fx"])
     metres = metres or float(stereo.get("b", 0))
     metres = metres or math.hypot(*numbers_in(stereo.get("T_c1_c2"))[3:12:4])
@@ -262,7 +467,7 @@ def zed(values: Values, image: Pair) -> Found:
         )
     both = (values[f"{side}_CAM_{name}"] for side in ("LEFT", "RIGHT"))
     cameras = [{**each, "resolution": sizes[name]} for each in both]
-    return Found(cameras, True, float(values["STEREO"]["Baseline"]))
+    return Found(cameras, True, number_at(values["STEREO"], "Baseline"))
 
 
 def depthai(values: Values, image: Pair) -> Found:
@@ -314,15 +519,23 @@ def meshroom(values: Values, image: Pair) -> Found | None:
 
 
 def metashape(values: Values, image: Pair) -> Found:
-    """Read Metashape's calibration, or its cameras of a chunk."""
-    root, cameras = values["metashape"], []
-    sensors = [each.findall("calibration") for each in root.iter("sensor")]
-    for found in [[root]] if root.tag == "calibration" else sensors:
-        for node in sorted(found, key=lambda each: each.get("class") != "adjusted")[:1]:
-            own = {**node.attrib, **{child.tag: child.text for child in node}}
-            own |= {} if (size := node.find("resolution")) is None else size.attrib
-            fx = float(own["f"]) + float(own.get("b1", 0))
-            cameras.append({**own, "fx": fx, "fy": own["f"]})
+    """Read Metashape's calibration, or its cameras of a chunk, both adjusted if there are two.
+
+    Before version 1.2, PhotoScan had fx and fy, and counted cx and cy from the corner.
+    """
+    cameras = []
+    for _, each in objects_in(values):
+        if nodes := each.get("calibration"):
+            nodes = nodes if isinstance(nodes, list) else [nodes]
+            own = min(nodes, key=lambda node: node.get("class") != "adjusted")
+            own = {**own, **own.get("resolution", {})}
+            if "fx" in own:
+                for centre, side in (("cx", "width"), ("cy", "height")):
+                    own[centre] = number_at(own, centre) - number_at(own, side) / 2
+            else:
+                fy = number_at(own, "f")
+                own |= {"fx": fy + sum(numbers_in(own.get("b1"))), "fy": fy}
+            cameras.append(own)
     return Found(cameras)
 
 
@@ -347,3 +560,41 @@ def nerfstudio(values: Values, image: Pair) -> Found:
         centre = (own["cx"], own["cy"]) if "cx" in own else size / 2
         cameras.append({**own, "fx": fx, "fy": fy, **dict(zip(("cx", "cy"), centre, strict=True))})
     return Found(cameras)
+
+
+def matlab(values: Values, image: Pair) -> Found | None:
+    """Read a structure of MATLAB's cameraParameters or stereoParameters; lengths are in mm."""
+    both = [values[key] for key in values if re.fullmatch(r"Camera(Parameters)?[12]", str(key))]
+    found = [dict(each) for each in both or [values]]
+    for each in found:
+        each["resolution"] = numbers_in(each.get("ImageSize"))[::-1]
+    length = math.hypot(*numbers_in(values.get("TranslationOfCamera2")))
+    return Found(found, len(both) == 2, in_mm(length, 1.0))
+
+
+FORMATS = (
+    Format("COLMAP's list of cameras", "COLMAP", colmap, 0.5),
+    Format("DSO's calibration", "DSO", dso),
+    Format("KITTI's calibration", r"P\d|P_rect_\d+", kitti),
+    Format("Middlebury's calibration", "cam0", middlebury),
+    Format("EuRoC's sensor.yaml", "T_BS", kalibr),
+    Format("Kalibr's calibration", "cam0|camera_model", kalibr),
+    Format("MATLAB's calibration", r"IntrinsicMatrix|RadialDistortion|\w+OfCamera2", matlab, 1.0),
+    Format("ORB-SLAM's or stella_vslam's calibration", "Camera1?", orb_slam),
+    Format("ZED's calibration", r"LEFT_CAM_\w+", zed),
+    Format("RealSense's calibration", "ppx", plain),
+    Format("DepthAI's calibration", "cameraData", depthai),
+    Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", plain, 0.0),
+    Format("OpenMVG's calibration", "sfm_data_version", openmvg, 0.0),
+    Format("Meshroom's calibration", "intrinsics", meshroom, 0.0),
+    Format("Metashape's calibration", "metashape", metashape, "middle"),
+    Format("Bundler's file", "bundler", bundler, "middle"),
+    Format("nerfstudio's transforms.json", "fl_x|camera_angle_x|frames", nerfstudio, 0.5),
+    Format("OpenSfM's list of cameras", ".*", opensfm, "fractions"),
+    Format("ROS's calibration", ".*", ros),
+    Format("the file", "matrix", opencv),
+    Format("ROS's calibration", "distortion_model|camera_name|projection_matrix", opencv),
+    Format("OpenCV's calibration", ".*", opencv),
+    ANY,
+)
+"""The formats, in the order in which they are tried."""
