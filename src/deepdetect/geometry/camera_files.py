@@ -14,7 +14,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from .._shared.errors import ReconstructionError
-from .camera_formats import FORMATS, Format, Found, Pair, Values, numbers_in, view_of
+from .camera_formats import FORMATS, Pair, Values, cameras_in, numbers_in
 
 FILES_OF_PAIRS = (
     *(("left.yaml", "right.yaml"), ("intrinsics.yml", "extrinsics.yml")),
@@ -103,7 +103,7 @@ def _parsed(content: bytes) -> Values:
 
 
 def _yaml(text: str) -> Any:
-    """Parse YAML, with OpenCV's tags; None for other text. "Camera.fx: 5" is {"Camera": {"fx": 5}}."""
+    """Parse YAML with OpenCV's tags; None for other text. "Camera.fx" becomes "fx" of "Camera"."""
     import yaml
 
     Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # a subclass, to accept OpenCV's tags
@@ -146,7 +146,8 @@ def _text(lines: str) -> Values:
             if sign and value:
                 section[key] = numbers_in(value) or value
             name = "" if start or value else key
-    return values
+    shared = values.pop("image", {})  # ROS's ost.txt has the size in its first section
+    return {key: {**shared, **each} if shared else each for key, each in values.items()}
 
 
 def _xml_values(node: ElementTree.Element) -> Any:
@@ -169,28 +170,17 @@ def _calib_json(values: Values, image: Pair) -> dict[str, Any]:
                     f"its key {key!r} is not known: use {known}, for images without distortion"
                 )
         return dict(values)
+    whose = "it"
     for form in FORMATS:
         if any(re.fullmatch(form.key, str(each)) for each in values):
             try:
-                if (found := form.read(values, image)) is not None:
-                    return {**_cameras(found, image, form), "format": form.name}
+                own = form.read(values, image)
+                if own is not None and (found := cameras_in(own, image, form)):
+                    return {**found, "format": form.name}
+                whose = whose if own in (None, values) else form.name
             except ReconstructionError as error:
                 raise ReconstructionError(form.name + str(error).removeprefix("it")) from None
             except KeyError as error:
                 raise ReconstructionError(f"{form.name} has no {error.args[0]}: add it") from None
     keys = ", ".join(map(str, [*values][:5]))
-    raise ReconstructionError(f"it has no cameras, only the keys {keys}: {KNOWN}")
-
-
-def _cameras(found: Found, image: Pair, form: Format) -> dict[str, Any]:
-    """Return a dictionary with the keys of calib.json for the cameras of a file."""
-    views = [view for each in found.cameras if (view := view_of(each, image, form))]
-    fitting = [v for v in views if (v.get("width"), v.get("height")) == image]
-    if found.stereo and (not fitting or views[0] in fitting):
-        baseline_mm = found.baseline_mm or None
-        return {**views[0], "left": views[0], "right": views[:2][-1], "baseline_mm": baseline_mm}
-    different = list({repr(view): view for view in fitting or views}.values())
-    if len(different) != 1:
-        number = f"{len(different)} different cameras" if different else "no cameras"
-        raise ReconstructionError(f"it has {number}: give a file with that of these images")
-    return {**different[0], "left": different[0], "right": different[0]}
+    raise ReconstructionError(f"{whose} has no cameras, only the keys {keys}: {KNOWN}")

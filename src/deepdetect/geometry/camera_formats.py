@@ -1,7 +1,9 @@
 """Formats of camera files: readers of the parsed files, and what all readers share.
 
-A reader takes the parsed file and the (width, height) of the image, if it is known, and returns the
-cameras as objects with names that `view_of` knows, or None for a file of another format.
+A reader takes the parsed file and the (width, height) of the image, if it is known, and returns it
+in usual names: cameras as objects with fx, fy, cx, cy or a matrix K, those of a pair as "left" and
+"right" or with their poses, and "baseline_mm". It returns None for a file of another format.
+`cameras_in` does the rest: it finds the cameras, checks them, and makes the keys of calib.json.
 """
 
 from __future__ import annotations
@@ -74,14 +76,6 @@ ZED_SIZES = {
 """Sizes of images in pixels, by the names that the sections of ZED's files have for them."""
 
 
-class Found(NamedTuple):
-    """The cameras of a file. The first two of a stereo pair are the left and the right one."""
-
-    cameras: Sequence[Values]
-    stereo: bool = False
-    baseline_mm: float | None = None
-
-
 class Format(NamedTuple):
     """A format: whose file it is, a pattern that one of its keys has, and its reader.
 
@@ -92,12 +86,12 @@ class Format(NamedTuple):
 
     name: str
     key: str
-    read: Callable[[Values, Pair], Found | None]
-    first: float | None | Literal["middle", "fractions"] = None
+    read: Callable[[Values, Pair], Any]
+    first: float | Literal["middle", "fractions"] | None = None
 
 
 def short(key: Any) -> str:
-    """Return a name in lower case without blanks, underscores, and the word camera before others."""
+    """Return a name in lower case, without blanks, underscores and the word camera at its start."""
     return re.sub(r"[_ ]|^cam(era)?[_ ]?(?=[a-z])(?!era)", "", str(key).lower())
 
 
@@ -163,11 +157,26 @@ def in_mm(length: float, unit: float | None = None) -> float | None:
         unit = MM_PER_M if length < METRES_BELOW else float(length >= MM_FROM)
         if not unit:
             warnings.warn(
-                f"the baseline {length:g} has no unit and may be in mm or cm, so it is left out and "
-                'lengths are in baselines: call it "baseline_mm", and give it in mm',
+                f"the baseline {length:g} has no unit and may be in mm or cm, so it is left out: "
+                'call it "baseline_mm" and give it in mm, else lengths are in baselines',
                 stacklevel=2,
             )
     return length * unit or None
+
+
+def baseline_in(values: Values, both: Sequence[np.ndarray]) -> float | None:
+    """Return the baseline in mm that an object states, also by its pair of matrices, or None."""
+    for key, value in values.items():
+        match, name = BASELINES.fullmatch(short(key)), str(key)
+        if match and len(numbers := numbers_in(value)) == 1:
+            units = zip(match.groups(), (1.0, MM_PER_CM, MM_PER_M), strict=True)
+            return in_mm(abs(numbers[0]), next((unit for word, unit in units if word), None))
+        if name in ("T_cn_cnm1", "T_c1_c2"):
+            return in_mm(math.hypot(*numbers_in(value)[3:12:4]), MM_PER_M)
+    if len(both) < 2:
+        return None
+    length = math.hypot(*numbers_in(values.get("T")))
+    return in_mm(length if both[0].shape[1] == 3 else apart(*both))
 
 
 def apart(left: np.ndarray, right: np.ndarray) -> float:
@@ -247,12 +256,11 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
     elif matrix_of(line, 4) is not None:  # fx, fy, cx, cy, as Kalibr has them
         focal, centre = numbers_in(line)[:2], numbers_in(line)[2:]
     corner = not isinstance(first, str)
-    if corner and not (focal and centre):
-        if not centre and not {"fx", "flx", "focalx"} & {*own}:
+    if not (focal and (centre or not corner)):
+        if not centre and not {"fx", "flx", "focalx", "projectiontype"} & {*own}:
             return None
         missing = "principal point (cx, cy)" if focal else "focal length (fx, fy)"
         raise ReconstructionError(f"it has no {missing}: add it in pixels")
-    check_pinhole(values)
     sides = np.array(size or image or (1, 1), np.float64)
     unit = sides.max() if first == "fractions" else 1.0
     focal = [unit * number for number in focal]
@@ -276,42 +284,64 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
     return {"focal_px": focal, "cx": float(x), "cy": float(y), **shape}
 
 
-def plain(values: Values, image: Pair = None) -> Found | None:
-    """Read any file that has cameras in the usual names; left and right by their names."""
-    found, length = [], None
+def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
+    """Return the cameras of a file in a dictionary with the keys of calib.json, or None.
+
+    Rectified projection matrices come before other matrices, which come before single numbers.
+    """
+    found, moves, length, distorted = [], [], None, False
     for name, each in objects_in(values):
-        check_pinhole(each)
-        found += [(name, each)] if view_of(each, None, ANY._replace(first=0.0)) else []
-        for key, value in each.items():
-            match = BASELINES.fullmatch(short(key))
-            if match and len(number := numbers_in(value)) == 1:
-                unit = next(
-                    (u for u, word in zip(UNITS, match.groups(), strict=True) if word), None
-                )
-                length = in_mm(abs(number[0]), unit)
-    cameras = [each for _, each in found]
-    sides = [[each for name, each in found if side in name] for side in ("left", "right")]
+        both = [matrix for matrix in matrices(each, PROJECTION, 12) if matrix[0, 0] > 0]
+        rectified, both = bool(both), both or matrices(each, MATRIX, 9, 12, 16)
+        try:
+            check_pinhole(each)
+        except ReconstructionError:
+            if not rectified:
+                raise
+            distorted = True
+        size = {key: number for key, number in each.items() if short(key) in SIZE_NAMES}
+        several = rectified or len(both) == 2
+        own = [{**size, "K": matrix} for matrix in both] if several else [each]
+        for side, camera in zip((" left", " right"), own, strict=False):
+            if view := view_of(camera, image, form):
+                found.append((f"{name} {side}" if len(own) == 2 else name, view))
+                pose = numbers_in(each.get("T_BS", each.get("T_SC", ())))[3:12:4]
+                moves.append((pose, both[0] if rectified else None))
+        length = length or baseline_in(each, both)
+    sides = [[view for name, view in found if side in name] for side in ("left", "right")]
     stereo = [len(side) for side in sides] == [1, 1]
-    cameras = sides[0] + sides[1] if stereo else cameras
-    length = length or (distance(*cameras) if len(cameras) == 2 else None)
-    return Found(cameras, stereo or bool(length and len(cameras) <= 2), length) if found else None
+    views = [view for _, view in found]
+    pair = sides[0] + sides[1] if stereo else views
+    if len(found) == 2 and not length:
+        (pose0, matrix0), (pose1, matrix1) = moves
+        if pose0 and pose1:
+            length = in_mm(math.dist(pose0, pose1), MM_PER_M)
+        elif matrix0 is not None and matrix1 is not None and matrix0 is not matrix1:
+            length = in_mm(apart(matrix0, matrix1), MM_PER_M)
+    if distorted and len(found) == 1:
+        warnings.warn(
+            "the calibration has distortion, and the projection matrix that is read is of the "
+            "images without it: give the rectified images (image_rect)",
+            stacklevel=2,
+        )
+    fitting = [view for view in views if (view.get("width"), view.get("height")) == image] or views
+    different = list({repr(view): view for view in fitting}.values())
+    if (stereo or (length and len(views) <= 2)) and pair[0] in fitting:
+        return {**pair[0], "left": pair[0], "right": pair[-1], "baseline_mm": length}
+    if len(different) > 1:
+        raise ReconstructionError(
+            f"it has {len(different)} different cameras: give a file with that of these images"
+        )
+    return {**different[0], "left": different[0], "right": different[0]} if different else None
 
 
-UNITS = 1.0, MM_PER_CM, MM_PER_M
-ANY = Format("the file", ".*", plain)
+def plain(values: Values, image: Pair) -> Values:
+    """Return a file with usual names."""
+    check_whole(values)
+    return values
 
 
-def distance(first: Values, second: Values) -> float | None:
-    """Return the baseline in mm from two poses (EuRoC, OKVIS) or two projection matrices (ROS)."""
-    for key in ("T_BS", "T_SC"):
-        if key in first and key in second:
-            left, right = (np.array(numbers_in(each[key]))[3:12:4] for each in (first, second))
-            return in_mm(float(np.linalg.norm(left - right)), MM_PER_M)
-    both = [matrices(each, PROJECTION, 12) for each in (first, second)]
-    return in_mm(apart(*(each[0] for each in both)), MM_PER_M) if all(both) else None
-
-
-def colmap(values: Values, image: Pair) -> Found:
+def colmap(values: Values, image: Pair) -> Any:
     """Read the lines of COLMAP's cameras.txt."""
     cameras = []
     for model, numbers in values["COLMAP"]:
@@ -320,10 +350,10 @@ def colmap(values: Values, image: Pair) -> Found:
             params.insert(0, params[0])
         size = {"model": model, "width": width, "height": height}
         cameras.append({**size, "intrinsics": params[:4], "coefficients": params[4:]})
-    return Found(cameras, len(cameras) == 2)
+    return dict(zip(("left", "right"), cameras, strict=True)) if len(cameras) == 2 else cameras
 
 
-def dso(values: Values, image: Pair) -> Found:
+def dso(values: Values, image: Pair) -> Values:
     """Read camera.txt of DSO and LSD-SLAM; numbers under 1 are fractions of width and height."""
     model, numbers, size = values["DSO"]
     size = np.array(numbers_in(size))
@@ -331,10 +361,10 @@ def dso(values: Values, image: Pair) -> Found:
     if cx < 1 and cy < 1:
         fx, fy, cx, cy = np.array([fx, fy, cx, cy]) * (*size, *size) - (0, 0, 0.5, 0.5)
     more = {"model": model, "coefficients": more, "resolution": size}
-    return Found([{"intrinsics": [fx, fy, cx, cy], **more}])
+    return {"intrinsics": [fx, fy, cx, cy], **more}
 
 
-def kitti(values: Values, image: Pair) -> Found | None:
+def kitti(values: Values, image: Pair) -> Values | None:
     """Read KITTI's P0 to P3 (odometry) or P_rect_00 to P_rect_03 (raw), by default 2 and 3."""
     found = {
         int(key[-1]): matrix
@@ -355,29 +385,21 @@ def kitti(values: Values, image: Pair) -> Found | None:
             stacklevel=2,
         )
     size = {"resolution": values.get(f"S_rect_0{first}")}
-    length = in_mm(apart(found[first], found[second]), MM_PER_M)
-    return Found([{**size, "K": found[number]} for number in (first, second)], True, length)
+    left, right = ({**size, "P": found[number]} for number in (first, second))
+    return {"left": left, "right": right} if first != second else left
 
 
-def middlebury(values: Values, image: Pair) -> Found | None:
+def middlebury(values: Values, image: Pair) -> Values | None:
     """Read Middlebury's calib.txt."""
-    both = matrices(values, "cam", 9)
-    if len(both) < 2:
+    if len(matrices(values, "cam", 9)) < 2:
         return None
-    both[1][0, 2] = both[0][0, 2] + sum(numbers_in(values.get("doffs"))) or both[1][0, 2]
-    size = {key: values.get(key) for key in ("width", "height")}
-    length = sum(numbers_in(values.get("baseline")))
-    return Found([{**size, "K": each} for each in both], True, in_mm(length, 1.0))
-
-
-def kalibr(values: Values, image: Pair) -> Found | None:
-    """Read a camera chain of Kalibr, or a file with one camera, such as EuRoC's sensor.yaml."""
-    found = [each for key in ("cam0", "cam1") if isinstance(each := values.get(key), Mapping)]
-    cameras = found or [values]
-    if not all({"camera_model", "intrinsics"} <= {*camera} for camera in cameras):
-        return None
-    length = math.hypot(*numbers_in(cameras[-1].get("T_cn_cnm1"))[3:12:4])
-    return Found(cameras, True, in_mm(length, MM_PER_M))
+    own = {key: values.get(key) for key in ("width", "height")}
+    return {
+        **own,
+        "K0": values["cam0"],
+        "K1": values["cam1"],
+        "baseline_mm": values.get("baseline"),
+    }
 
 
 def check_whole(values: Values) -> None:
@@ -392,58 +414,16 @@ def check_whole(values: Values) -> None:
                 )
 
 
-def ros(values: Values, image: Pair) -> Found | None:
-    """Read ROS's camera_info or ost.txt: the projection matrices, which are of rectified images."""
-    shared = values["image"] if isinstance(values.get("image"), Mapping) else {}
-    found, cameras = [], []
-    check_whole(values)
-    for _, each in objects_in(values):
-        both = matrices(each, PROJECTION, 12), matrices(each, MATRIX, 9)
-        if [len(some) for some in both] == [1, 1] and both[0][0][0, 0] > 0:
-            found.append(each)
-            size = {key: n for key, n in {**shared, **each}.items() if short(key) in SIZE_NAMES}
-            cameras.append({**size, "K": both[0][0]})
-    if len(found) == 1:
-        try:
-            check_pinhole(found[0])
-        except ReconstructionError:
-            warnings.warn(
-                "the calibration has distortion, and the projection matrix that is read is of the "
-                "images without it: give the rectified images (image_rect)",
-                stacklevel=2,
-            )
-    length = distance(*found) if len(found) == 2 else None
-    return Found(cameras, len(found) == 2, length) if found else None
+def openmvg(values: Values, image: Pair) -> Any:
+    """Return the cameras of OpenMVG's sfm_data.json without its points, which may be millions."""
+    return values["intrinsics"]
 
 
-def opencv(values: Values, image: Pair) -> Found | None:
-    """Read a file of OpenCV. If it has distortion, it also needs rectified projections."""
-    found, length = matrices(values, PROJECTION, 12), 0.0
-    if len(found) == 2:
-        length = apart(*found)
-    else:
-        found = matrices(values, MATRIX, 9, 12)
-        for _, each in objects_in(values) if found else ():
-            check_pinhole(each)
-        if len(found) == 2:
-            length = math.hypot(*numbers_in(values.get("T")))
-    if len(found) < 2:
-        return Found([values]) if found else None
-    size = {key: number for key, number in values.items() if short(key) in SIZE_NAMES}
-    return Found([{**size, "K": matrix} for matrix in found], True, in_mm(length))
-
-
-def openmvg(values: Values, image: Pair) -> Found | None:
-    """Read OpenMVG's sfm_data.json."""
-    return plain({"intrinsics": values["intrinsics"]}, image)
-
-
-def orb_slam(values: Values, image: Pair) -> Found | None:
+def orb_slam(values: Values, image: Pair) -> Any:
     """Read settings of ORB-SLAM or stella_vslam. Lengths are in metres, also in fx * baseline."""
     shared: Any = values.get("Camera", {})
     if not isinstance(shared, Mapping):
         return None
-    check_pinhole(shared)
     found = [{**shared, **values[key]} for key in ("Camera1", "Camera2") if key in values]
     found, stereo = found or [dict(shared)], values.get("Stereo", {})
     if not {"fx", "type", "model", "bf"} & {*found[0]}:
@@ -453,10 +433,10 @@ def orb_slam(values: Values, image: Pair) -> Found | None:
     metres = metres or math.hypot(*numbers_in(stereo.get("T_c1_c2"))[3:12:4])
     if re.search("depth_?map_?factor", str(values), re.IGNORECASE):
         metres = 0.0  # the two cameras of a depth camera do not take the images
-    return Found(found, True, metres * MM_PER_M)
+    return {"left": found[0], "right": found[-1], "baseline_mm": metres * MM_PER_M}
 
 
-def zed(values: Values, image: Pair) -> Found:
+def zed(values: Values, image: Pair) -> Values:
     """Read ZED's SN.conf, which has sections by the size of the image, and the baseline in mm."""
     sizes = {name: size for name, size in ZED_SIZES.items() if f"LEFT_CAM_{name}" in values}
     name = next((name for name, size in sizes.items() if image in (None, size)), None)
@@ -466,37 +446,39 @@ def zed(values: Values, image: Pair) -> Found:
             f"it has no section for this size of images, only for {known}: resize them"
         )
     both = (values[f"{side}_CAM_{name}"] for side in ("LEFT", "RIGHT"))
-    cameras = [{**each, "resolution": sizes[name]} for each in both]
-    return Found(cameras, True, number_at(values["STEREO"], "Baseline"))
+    left, right = ({**each, "resolution": sizes[name]} for each in both)
+    return {"left": left, "right": right, "baseline_mm": values["STEREO"]["Baseline"]}
 
 
-def depthai(values: Values, image: Pair) -> Found:
+def depthai(values: Values, image: Pair) -> Values:
     """Read DepthAI's calibration: left, right and other cameras. Lengths are in cm."""
     data = values["cameraData"]
     pairs = data.items() if isinstance(data, Mapping) else data
-    cameras = {int(key): each for key, each in pairs if any(numbers_in(each["intrinsicMatrix"]))}
-    for each in cameras.values():
-        check_pinhole({"fisheye": each.get("cameraType") == 1})
+    cameras = {
+        int(key): {**each, "fisheye": each.get("cameraType") == 1}
+        for key, each in pairs
+        if any(numbers_in(each["intrinsicMatrix"]))
+    }
     rig = values.get("stereoRectificationData", {})
     ends = [rig.get(f"{side}CameraSocket", -1) for side in ("left", "right")]
     ends = ends if {*ends} <= {*cameras} else [1, 2]
-    lengths: list[float] = []
-    for start, end in (ends, ends[::-1]):
-        move = cameras.get(start, {}).get("extrinsics", {})
-        for name in ("translation", "specTranslation") if move.get("toCameraSocket") == end else ():
-            lengths.append(math.hypot(*numbers_in(move.get(name))))
-    ordered = [cameras[key] for key in sorted(cameras, key=[*ends, *cameras].index)]
-    length = next(filter(None, lengths), 0.0)
-    return Found(ordered, {*ends} <= {*cameras}, length * MM_PER_CM)
+    lengths = [
+        math.hypot(*numbers_in(move.get(name)))
+        for start, end in (ends, ends[::-1])
+        if (move := cameras.get(start, {}).get("extrinsics", {})).get("toCameraSocket") == end
+        for name in ("translation", "specTranslation")
+    ]
+    names = dict(zip(ends, ("left", "right"), strict=True))
+    found: dict[Any, Any] = {names.get(key, key): each for key, each in cameras.items()}
+    return {**found, "baseline_cm": next(filter(None, lengths), 0.0)}
 
 
-def opensfm(values: Values, image: Pair) -> Found | None:
+def opensfm(values: Values, image: Pair) -> Any:
     """Read OpenSfM's camera models or reconstruction."""
-    cameras = [each for _, each in objects_in(values) if "projection_type" in each]
-    return Found(cameras) if cameras else None
+    return [each for _, each in objects_in(values) if "projection_type" in each] or None
 
 
-def meshroom(values: Values, image: Pair) -> Found | None:
+def meshroom(values: Values, image: Pair) -> Any:
     """Read Meshroom's cameras.sfm.
 
     Since version 1.2.1 the principal point is relative to half the width and half the height, since
@@ -506,7 +488,6 @@ def meshroom(values: Values, image: Pair) -> Found | None:
         return None
     version, cameras = numbers_in(values["version"]), []
     for each in values["intrinsics"]:
-        check_pinhole(each)
         size = np.array([float(each["width"]), float(each["height"])])
         focal = numbers_in(each.get("pxFocalLength"))
         if not focal:
@@ -514,11 +495,12 @@ def meshroom(values: Values, image: Pair) -> Found | None:
             ratio = float(each.get("pixelRatio", 1))
             focal = [fx, fx * (ratio if version >= [1, 2, 5] else 1 / ratio)]
         centre = np.array(numbers_in(each["principalPoint"])) + size / 2 * (version >= [1, 2, 1])
-        cameras.append({"focal": focal, "principal_point": centre, "resolution": size})
-    return Found(cameras)
+        own = {"focal": focal, "principal_point": centre, "resolution": size}
+        cameras.append({**own, **{key: each[key] for key in each if "ist" in key or key == "type"}})
+    return cameras
 
 
-def metashape(values: Values, image: Pair) -> Found:
+def metashape(values: Values, image: Pair) -> Any:
     """Read Metashape's calibration, or its cameras of a chunk, both adjusted if there are two.
 
     Before version 1.2, PhotoScan had fx and fy, and counted cx and cy from the corner.
@@ -536,21 +518,21 @@ def metashape(values: Values, image: Pair) -> Found:
                 fy = number_at(own, "f")
                 own |= {"fx": fy + sum(numbers_in(own.get("b1"))), "fy": fy}
             cameras.append(own)
-    return Found(cameras)
+    return cameras
 
 
-def bundler(values: Values, image: Pair) -> Found:
+def bundler(values: Values, image: Pair) -> Any:
     """Read a file of Bundler: f, k1, k2, rotation and translation; f is 0 without a pose."""
     count, _, *numbers = values["bundler"]
     rows = np.reshape(numbers[: 15 * int(count)], (-1, 15)).tolist()
-    return Found([{"f": row[0], "coefficients": row[1:3]} for row in rows if row[0]])
+    return [{"f": row[0], "coefficients": row[1:3]} for row in rows if row[0]]
 
 
-def nerfstudio(values: Values, image: Pair) -> Found:
+def nerfstudio(values: Values, image: Pair) -> Any:
     """Read transforms.json of nerfstudio or instant-ngp, whose frames may have own cameras."""
     cameras = []
     for frame in values.get("frames") or [{}]:
-        own = {**values, **frame}
+        own = {**values, **frame, "frames": ()}
         if "fl_x" not in own and "camera_angle_x" not in own:
             raise ReconstructionError("it has neither fl_x nor camera_angle_x: add fl_x in pixels")
         size = np.array((own["w"], own["h"]) if "w" in own else image or (1, 1))
@@ -559,17 +541,17 @@ def nerfstudio(values: Values, image: Pair) -> Found:
         fx, fy = own.get("fl_x") or fx, own.get("fl_y") or own.get("fl_x") or fy or fx
         centre = (own["cx"], own["cy"]) if "cx" in own else size / 2
         cameras.append({**own, "fx": fx, "fy": fy, **dict(zip(("cx", "cy"), centre, strict=True))})
-    return Found(cameras)
+    return cameras
 
 
-def matlab(values: Values, image: Pair) -> Found | None:
+def matlab(values: Values, image: Pair) -> Values:
     """Read a structure of MATLAB's cameraParameters or stereoParameters; lengths are in mm."""
     both = [values[key] for key in values if re.fullmatch(r"Camera(Parameters)?[12]", str(key))]
-    found = [dict(each) for each in both or [values]]
-    for each in found:
-        each["resolution"] = numbers_in(each.get("ImageSize"))[::-1]
+    found = [
+        {**each, "resolution": numbers_in(each.get("ImageSize"))[::-1]} for each in both or [values]
+    ]
     length = math.hypot(*numbers_in(values.get("TranslationOfCamera2")))
-    return Found(found, len(both) == 2, in_mm(length, 1.0))
+    return {"left": found[0], "right": found[-1], "baseline_mm": length}
 
 
 FORMATS = (
@@ -577,8 +559,9 @@ FORMATS = (
     Format("DSO's calibration", "DSO", dso),
     Format("KITTI's calibration", r"P\d|P_rect_\d+", kitti),
     Format("Middlebury's calibration", "cam0", middlebury),
-    Format("EuRoC's sensor.yaml", "T_BS", kalibr),
-    Format("Kalibr's calibration", "cam0|camera_model", kalibr),
+    Format("nerfstudio's transforms.json", "fl_x|camera_angle_x|frames", nerfstudio, 0.5),
+    Format("EuRoC's sensor.yaml", "T_BS", plain),
+    Format("Kalibr's calibration", "cam0|camera_model", plain),
     Format("MATLAB's calibration", r"IntrinsicMatrix|RadialDistortion|\w+OfCamera2", matlab, 1.0),
     Format("ORB-SLAM's or stella_vslam's calibration", "Camera1?", orb_slam),
     Format("ZED's calibration", r"LEFT_CAM_\w+", zed),
@@ -589,12 +572,10 @@ FORMATS = (
     Format("Meshroom's calibration", "intrinsics", meshroom, 0.0),
     Format("Metashape's calibration", "metashape", metashape, "middle"),
     Format("Bundler's file", "bundler", bundler, "middle"),
-    Format("nerfstudio's transforms.json", "fl_x|camera_angle_x|frames", nerfstudio, 0.5),
     Format("OpenSfM's list of cameras", ".*", opensfm, "fractions"),
-    Format("ROS's calibration", ".*", ros),
-    Format("the file", "matrix", opencv),
-    Format("ROS's calibration", "distortion_model|camera_name|projection_matrix", opencv),
-    Format("OpenCV's calibration", ".*", opencv),
-    ANY,
+    Format("camodocal's or VINS's calibration", r"(projection|mirror)_parameters", plain),
+    Format("ROS's calibration", r"distortion_model|projection_matrix|camera_name|D|d", plain),
+    Format("OpenCV's calibration", r"[MKP]1|cameraMatrix\w*|camera_matrix|distCoeffs", plain),
+    Format("the file", ".*", plain),
 )
 """The formats, in the order in which they are tried."""
