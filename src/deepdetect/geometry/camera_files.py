@@ -146,8 +146,9 @@ def _text(lines: str) -> Values:
             if sign and value:
                 section[key] = numbers_in(value) or value
             name = "" if start or value else key
-    shared = values.pop("image", {})  # ROS's ost.txt has the size in its first section
-    return {key: {**shared, **each} if shared else each for key, each in values.items()}
+    if isinstance(size := values.get("image"), dict):  # ROS's ost.txt has the size in this section
+        values = {key: {**size, **each} for key, each in values.items() if isinstance(each, dict)}
+    return values
 
 
 def _xml_values(node: ElementTree.Element) -> Any:
@@ -174,7 +175,7 @@ def _calib_json(values: Values, image: Pair) -> dict[str, Any]:
     for form in FORMATS:
         if any(re.fullmatch(form.key, str(each)) for each in values):
             try:
-                own = form.read(values, image)
+                own = form.read(values, image) if form.read else values
                 if own is not None and (found := cameras_in(own, image, form)):
                     return {**found, "format": form.name}
                 whose = whose if own in (None, values) else form.name

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -77,7 +77,7 @@ ZED_SIZES = {
 
 
 class Format(NamedTuple):
-    """A format: whose file it is, a pattern that one of its keys has, and its reader.
+    """A format: whose file it is, a pattern that one of its keys has, and its reader, if needed.
 
     `first` is the x and y of the centre of the first pixel; None means 0, but 1 for MATLAB's
     matrix. Principal points may also begin in the "middle"; "fractions" are of the longer side of
@@ -86,7 +86,7 @@ class Format(NamedTuple):
 
     name: str
     key: str
-    read: Callable[[Values, Pair], Any]
+    read: Callable[[Values, Pair], Any] | None = None
     first: float | Literal["middle", "fractions"] | None = None
 
 
@@ -106,7 +106,7 @@ def numbers_in(value: Any) -> list[float]:
         except ValueError:
             return []
     if isinstance(value, Mapping):
-        value = value["data"] if "data" in value else [*value.values()]
+        return numbers_in(value["data"] if "data" in value else [*value.values()])
     if isinstance(value, list | tuple | np.ndarray):
         return [number for each in value for number in numbers_in(each)]
     return [] if value is None or isinstance(value, bool) else [float(value)]
@@ -164,27 +164,18 @@ def in_mm(length: float, unit: float | None = None) -> float | None:
     return length * unit or None
 
 
-def baseline_in(values: Values, both: Sequence[np.ndarray]) -> float | None:
-    """Return the baseline in mm that an object states, also by its pair of matrices, or None."""
+def baseline_in(values: Values, pair: bool) -> float | None:
+    """Return the baseline in mm that an object states, or None. A pair may have it as T."""
     for key, value in values.items():
-        match, name = BASELINES.fullmatch(short(key)), str(key)
-        if match and len(numbers := numbers_in(value)) == 1:
+        if match := BASELINES.fullmatch(short(key)):
             units = zip(match.groups(), (1.0, MM_PER_CM, MM_PER_M), strict=True)
-            return in_mm(abs(numbers[0]), next((unit for word, unit in units if word), None))
-        if name in ("T_cn_cnm1", "T_c1_c2"):
+            length = abs(sum(numbers_in(value)[:1]))
+            return in_mm(length, next((unit for word, unit in units if word), None))
+        if key == "T" and pair:
+            return in_mm(math.hypot(*numbers_in(value)))
+        if key in ("T_cn_cnm1", "T_c1_c2"):
             return in_mm(math.hypot(*numbers_in(value)[3:12:4]), MM_PER_M)
-    if len(both) < 2:
-        return None
-    length = math.hypot(*numbers_in(values.get("T")))
-    return in_mm(length if both[0].shape[1] == 3 else apart(*both))
-
-
-def apart(left: np.ndarray, right: np.ndarray) -> float:
-    """Return the distance between two cameras by their projection matrices."""
-    distance = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
-    if distance < 0:
-        raise ReconstructionError("it has its second camera to the left of its first: swap the two")
-    return distance
+    return None
 
 
 def check_pinhole(values: Values) -> None:
@@ -196,9 +187,16 @@ def check_pinhole(values: Values) -> None:
             raise ReconstructionError(
                 f"it has a camera that is no pinhole ({key} {value!r}): undistort the images"
             )
-        if not DISTORTIONS.fullmatch(name):
+        if not (DISTORTIONS.fullmatch(name) or CROPS.fullmatch(str(key))):
             continue
         numbers = numbers_in(value)
+        if CROPS.fullmatch(str(key)):
+            if any(number > str(key).startswith("binning") for number in numbers):
+                raise ReconstructionError(
+                    f"it is for a part or a smaller copy of the camera's images ({key} {value}): "
+                    "give the calibration of these images"
+                )
+            continue
         name = name if len(numbers) == 1 else name.rstrip("0123456789")  # K1 may be a matrix
         if DISTORTIONS.fullmatch(name) and not all(abs(number) <= ROUNDING for number in numbers):
             raise ReconstructionError(
@@ -248,8 +246,9 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
     If the object describes no camera, None is returned.
     """
     own = {short(key): value for key, value in values.items()}
-    size, first, centre = _pair_at(own, SIZES), form.first, _pair_at(own, CENTRES)
-    focal, line = _pair_at(own, FOCAL_LENGTHS), own.get("intrinsics")
+    first: Any = form.first
+    focal, centre = _pair_at(own, FOCAL_LENGTHS), _pair_at(own, CENTRES)
+    line = own.get("intrinsics")
     matrix = next(iter(matrices(values, MATRIX, 9, 12, 16)), None)
     if matrix is not None:
         focal, centre, first = _of_matrix(matrix, first)
@@ -261,6 +260,7 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
             return None
         missing = "principal point (cx, cy)" if focal else "focal length (fx, fy)"
         raise ReconstructionError(f"it has no {missing}: add it in pixels")
+    size = _pair_at(own, SIZES)
     sides = np.array(size or image or (1, 1), np.float64)
     unit = sides.max() if first == "fractions" else 1.0
     focal = [unit * number for number in focal]
@@ -289,10 +289,12 @@ def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
 
     Rectified projection matrices come before other matrices, which come before single numbers.
     """
-    found, moves, length, distorted = [], [], None, False
+    found: list[tuple[str, dict[str, Any], list[float]]] = []
+    length, offset, distorted = None, [], False
+    unit: float | None = MM_PER_M
     for name, each in objects_in(values):
-        both = [matrix for matrix in matrices(each, PROJECTION, 12) if matrix[0, 0] > 0]
-        rectified, both = bool(both), both or matrices(each, MATRIX, 9, 12, 16)
+        rectified = [matrix for matrix in matrices(each, PROJECTION, 12) if matrix[0, 0] > 0]
+        both = rectified or matrices(each, MATRIX, 9, 12, 16)
         try:
             check_pinhole(each)
         except ReconstructionError:
@@ -300,45 +302,45 @@ def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
                 raise
             distorted = True
         size = {key: number for key, number in each.items() if short(key) in SIZE_NAMES}
-        several = rectified or len(both) == 2
-        own = [{**size, "K": matrix} for matrix in both] if several else [each]
-        for side, camera in zip((" left", " right"), own, strict=False):
+        own = [{**size, "K": matrix} for matrix in both] if rectified or both[1:] else [each]
+        for index, camera in enumerate(own):
             if view := view_of(camera, image, form):
-                found.append((f"{name} {side}" if len(own) == 2 else name, view))
-                pose = numbers_in(each.get("T_BS", each.get("T_SC", ())))[3:12:4]
-                moves.append((pose, both[0] if rectified else None))
-        length = length or baseline_in(each, both)
-    sides = [[view for name, view in found if side in name] for side in ("left", "right")]
+                place = numbers_in(each.get("T_BS", each.get("T_SC")))[3:12:4]
+                place = [-float(m[0, 3] / m[0, 0]) for m in rectified[index : index + 1]] or place
+                found.append((name + (" left", " right")[index] * len(own[1:]), view, place))
+        length = length or baseline_in(each, pair=bool(both[1:] and not rectified))
+        unit = None if both[1:] else unit
+        offset = offset or numbers_in(each.get("doffs"))
+    if not found:
+        return None
+    sides = [[each for each in found if side in each[0]] for side in ("left", "right")]
     stereo = [len(side) for side in sides] == [1, 1]
-    views = [view for _, view in found]
-    pair = sides[0] + sides[1] if stereo else views
-    if len(found) == 2 and not length:
-        (pose0, matrix0), (pose1, matrix1) = moves
-        if pose0 and pose1:
-            length = in_mm(math.dist(pose0, pose1), MM_PER_M)
-        elif matrix0 is not None and matrix1 is not None and matrix0 is not matrix1:
-            length = in_mm(apart(matrix0, matrix1), MM_PER_M)
+    pair = sides[0] + sides[1] if stereo else found
+    if len(pair) == 2 and not length and all(place for _, _, place in pair):
+        places = [place for _, _, place in pair]
+        if len(places[0]) == 1 and places[0] > places[1]:
+            raise ReconstructionError(
+                "it has its second camera to the left of its first: swap the two"
+            )
+        length = in_mm(math.dist(*places), unit)
     if distorted and len(found) == 1:
         warnings.warn(
             "the calibration has distortion, and the projection matrix that is read is of the "
             "images without it: give the rectified images (image_rect)",
             stacklevel=2,
         )
+    views = [view for _, view, _ in found]
     fitting = [view for view in views if (view.get("width"), view.get("height")) == image] or views
-    different = list({repr(view): view for view in fitting}.values())
-    if (stereo or (length and len(views) <= 2)) and pair[0] in fitting:
-        return {**pair[0], "left": pair[0], "right": pair[-1], "baseline_mm": length}
-    if len(different) > 1:
-        raise ReconstructionError(
-            f"it has {len(different)} different cameras: give a file with that of these images"
-        )
-    return {**different[0], "left": different[0], "right": different[0]} if different else None
-
-
-def plain(values: Values, image: Pair) -> Values:
-    """Return a file with usual names."""
-    check_whole(values)
-    return values
+    (_, left, _), (_, right, _) = pair[0], pair[-1]
+    if left not in fitting or not (stereo or (length and len(pair) <= 2)):
+        different = {repr(view): view for view in fitting}
+        if len(different) > 1:
+            raise ReconstructionError(
+                f"it has {len(different)} different cameras: give a file with that of these images"
+            )
+        left, right, length = fitting[0], fitting[0], None
+    values = {"left": left, "right": right, "baseline_mm": length}
+    return {**left, **values, "disparity_offset_px": (offset or [None])[0]}
 
 
 def colmap(values: Values, image: Pair) -> Any:
@@ -355,13 +357,11 @@ def colmap(values: Values, image: Pair) -> Any:
 
 def dso(values: Values, image: Pair) -> Values:
     """Read camera.txt of DSO and LSD-SLAM; numbers under 1 are fractions of width and height."""
-    model, numbers, size = values["DSO"]
-    size = np.array(numbers_in(size))
-    fx, fy, cx, cy, *more = numbers_in(numbers)
-    if cx < 1 and cy < 1:
-        fx, fy, cx, cy = np.array([fx, fy, cx, cy]) * (*size, *size) - (0, 0, 0.5, 0.5)
-    more = {"model": model, "coefficients": more, "resolution": size}
-    return {"intrinsics": [fx, fy, cx, cy], **more}
+    model, numbers, sides = values["DSO"]
+    size, camera, more = numbers_in(sides), numbers_in(numbers)[:4], numbers_in(numbers)[4:]
+    if max(camera[2:]) < 1:
+        camera = (np.array(camera) * (*size, *size) - (0, 0, 0.5, 0.5)).tolist()
+    return {"model": model, "intrinsics": camera, "coefficients": more, "resolution": size}
 
 
 def kitti(values: Values, image: Pair) -> Values | None:
@@ -400,18 +400,6 @@ def middlebury(values: Values, image: Pair) -> Values | None:
         "K1": values["cam1"],
         "baseline_mm": values.get("baseline"),
     }
-
-
-def check_whole(values: Values) -> None:
-    """Raise an error if ROS's values say that the images are a part or a smaller copy of others."""
-    for _, each in objects_in(values):
-        for key, value in each.items():
-            numbers = numbers_in(value) if CROPS.fullmatch(str(key)) else []
-            if numbers and numbers[0] > str(key).startswith("binning"):  # 0 and 1: no binning
-                raise ReconstructionError(
-                    f"it is for a part or a smaller copy of the camera's images ({key} "
-                    f"{numbers[0]:g}): give the calibration of these images"
-                )
 
 
 def openmvg(values: Values, image: Pair) -> Any:
@@ -560,22 +548,22 @@ FORMATS = (
     Format("KITTI's calibration", r"P\d|P_rect_\d+", kitti),
     Format("Middlebury's calibration", "cam0", middlebury),
     Format("nerfstudio's transforms.json", "fl_x|camera_angle_x|frames", nerfstudio, 0.5),
-    Format("EuRoC's sensor.yaml", "T_BS", plain),
-    Format("Kalibr's calibration", "cam0|camera_model", plain),
+    Format("EuRoC's sensor.yaml", "T_BS"),
+    Format("Kalibr's calibration", "cam0|camera_model"),
     Format("MATLAB's calibration", r"IntrinsicMatrix|RadialDistortion|\w+OfCamera2", matlab, 1.0),
     Format("ORB-SLAM's or stella_vslam's calibration", "Camera1?", orb_slam),
     Format("ZED's calibration", r"LEFT_CAM_\w+", zed),
-    Format("RealSense's calibration", "ppx", plain),
+    Format("RealSense's calibration", "ppx"),
     Format("DepthAI's calibration", "cameraData", depthai),
-    Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", plain, 0.0),
+    Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", None, 0.0),
     Format("OpenMVG's calibration", "sfm_data_version", openmvg, 0.0),
     Format("Meshroom's calibration", "intrinsics", meshroom, 0.0),
     Format("Metashape's calibration", "metashape", metashape, "middle"),
     Format("Bundler's file", "bundler", bundler, "middle"),
     Format("OpenSfM's list of cameras", ".*", opensfm, "fractions"),
-    Format("camodocal's or VINS's calibration", r"(projection|mirror)_parameters", plain),
-    Format("ROS's calibration", r"distortion_model|projection_matrix|camera_name|D|d", plain),
-    Format("OpenCV's calibration", r"[MKP]1|cameraMatrix\w*|camera_matrix|distCoeffs", plain),
-    Format("the file", ".*", plain),
+    Format("camodocal's or VINS's calibration", r"(projection|mirror)_parameters"),
+    Format("ROS's calibration", r"distortion_model|projection_matrix|camera_name|D|d"),
+    Format("OpenCV's calibration", r"[MKP]1|cameraMatrix\w*|camera_matrix|distCoeffs"),
+    Format("the file", ".*"),
 )
 """The formats, in the order in which they are tried."""
