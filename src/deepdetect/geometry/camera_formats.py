@@ -36,7 +36,7 @@ MIN_FOCAL = 0.1
 """A focal length under this fraction of the longer side of the image is refused as one in another
 unit, because in pixels it would mean a pinhole camera with a field of view above 157 degrees."""
 
-MATRIX = r"(?:new|color|rgb|cam(?:era)?)*(?:intrinsics?)?(?:matrix|mtx)|intrinsics?|[km]"
+MATRIX = r"(?:new|color|rgb|cam(?:era)?)*(?:intrinsics?)?(?:matrix|mtx)|intrinsics?|cam|[km]"
 PROJECTION = r"p|projection(?:matrix)?"
 SIDES = ("left", "right"), ("l", "r"), ("1", "2"), ("0", "1")
 FOCAL_LENGTHS = (
@@ -110,11 +110,6 @@ def numbers_in(value: Any) -> list[float]:
     if isinstance(value, list | tuple | np.ndarray):
         return [number for each in value for number in numbers_in(each)]
     return [] if value is None or isinstance(value, bool) else [float(value)]
-
-
-def number_at(values: Values, key: str) -> float:
-    """Return the number at a key that must be there."""
-    return numbers_in(values[key])[0]
 
 
 def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
@@ -390,21 +385,8 @@ def kitti(values: Values, image: Pair) -> Values | None:
 
 
 def middlebury(values: Values, image: Pair) -> Values | None:
-    """Read Middlebury's calib.txt."""
-    if len(matrices(values, "cam", 9)) < 2:
-        return None
-    own = {key: values.get(key) for key in ("width", "height")}
-    return {
-        **own,
-        "K0": values["cam0"],
-        "K1": values["cam1"],
-        "baseline_mm": values.get("baseline"),
-    }
-
-
-def openmvg(values: Values, image: Pair) -> Any:
-    """Return the cameras of OpenMVG's sfm_data.json without its points, which may be millions."""
-    return values["intrinsics"]
+    """Read Middlebury's calib.txt, whose baseline is in mm."""
+    return {"baseline_mm": values["baseline"], **values} if "baseline" in values else None
 
 
 def orb_slam(values: Values, image: Pair) -> Any:
@@ -499,12 +481,12 @@ def metashape(values: Values, image: Pair) -> Any:
             nodes = nodes if isinstance(nodes, list) else [nodes]
             own = min(nodes, key=lambda node: node.get("class") != "adjusted")
             own = {**own, **own.get("resolution", {})}
+            number = {key: sum(numbers_in(value)[:1]) for key, value in own.items()}
             if "fx" in own:
-                for centre, side in (("cx", "width"), ("cy", "height")):
-                    own[centre] = number_at(own, centre) - number_at(own, side) / 2
+                own["cx"] = number["cx"] - number["width"] / 2
+                own["cy"] = number["cy"] - number["height"] / 2
             else:
-                fy = number_at(own, "f")
-                own |= {"fx": fy + sum(numbers_in(own.get("b1"))), "fy": fy}
+                own |= {"fx": number["f"] + number.get("b1", 0), "fy": number["f"]}
             cameras.append(own)
     return cameras
 
@@ -556,7 +538,7 @@ FORMATS = (
     Format("RealSense's calibration", "ppx"),
     Format("DepthAI's calibration", "cameraData", depthai),
     Format("Open3D's camera", "intrinsic_matrix|intrinsic|parameters", None, 0.0),
-    Format("OpenMVG's calibration", "sfm_data_version", openmvg, 0.0),
+    Format("OpenMVG's calibration", "sfm_data_version", lambda own, _: own["intrinsics"], 0.0),
     Format("Meshroom's calibration", "intrinsics", meshroom, 0.0),
     Format("Metashape's calibration", "metashape", metashape, "middle"),
     Format("Bundler's file", "bundler", bundler, "middle"),
