@@ -581,3 +581,19 @@ def test_refusals_give_the_true_reason(content: Any, word: str, tmp_path: Path) 
     with pytest.raises(ReconstructionError, match=word) as error:
         load(tmp_path, content)
     assert "damaged" not in str(error.value)
+
+
+def test_a_file_that_is_no_text_is_refused_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "camera.npz"
+    np.savez(path, K=np.eye(3))
+    with pytest.raises(ReconstructionError, match="text"):
+        Calibration.load(path, SIZE)
+
+
+def test_zeros_of_opencv_are_no_fisheye(tmp_path: Path) -> None:
+    values = "<fisheye_model>0</fisheye_model><K><rows>3</rows><cols>3</cols><data>{}</data></K>"
+    numbers = " ".join(map(str, np.ravel(MATRIX)))
+    assert (
+        load(tmp_path, f"<opencv_storage>{values.format(numbers)}</opencv_storage>").camera0
+        == CAMERA
+    )

@@ -64,6 +64,8 @@ def read_camera_file(path: Path, image: Pair = None, views: Pair = None) -> dict
 
 def _parsed(content: bytes) -> Values:
     """Parse a camera file, without `cv2.FileStorage`, which hangs or crashes on damaged files."""
+    if b"\0" in content:
+        raise ReconstructionError(f"it is no text: {KNOWN}")
     text = content.decode("utf-8", "replace").lstrip("\ufeff \r\n\t")
     if text.startswith("<"):
         root = ElementTree.fromstring(text)
@@ -97,7 +99,7 @@ def _parsed(content: bytes) -> Values:
     if isinstance(values, list) and any(isinstance(each, Mapping) for each in values):
         values = dict(enumerate(values))  # a list of words is a [section]
     values = values if isinstance(values, dict) else _text(lines)
-    if not values and text[0] != "{":
+    if not values and text[:1] != "{":
         raise ReconstructionError(f"it holds no cameras: {KNOWN}")
     return values
 

@@ -178,7 +178,8 @@ def check_pinhole(values: Values) -> None:
     for key, value in values.items():
         name = short(key)
         words = value.replace("_", " ") if isinstance(value, str) else ""
-        if (MODELS.fullmatch(name) and NO_PINHOLES.search(words)) or ("fisheye" in name and value):
+        fisheye = "fisheye" in name and value and numbers_in(value) != [0]
+        if fisheye or (MODELS.fullmatch(name) and NO_PINHOLES.search(words)):
             raise ReconstructionError(
                 f"it has a camera that is no pinhole ({key} {value!r}): undistort the images"
             )
@@ -285,7 +286,8 @@ def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
     Rectified projection matrices come before other matrices, which come before single numbers.
     """
     found: list[tuple[str, dict[str, Any], list[float]]] = []
-    length, offset, distorted = None, [], False
+    length, distorted = None, False
+    offset: list[float] = []
     unit: float | None = MM_PER_M
     for name, each in objects_in(values):
         rectified = [matrix for matrix in matrices(each, PROJECTION, 12) if matrix[0, 0] > 0]
