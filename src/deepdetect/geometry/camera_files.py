@@ -154,6 +154,8 @@ def _text(lines: str) -> Values:
 
 
 def _xml_values(node: ElementTree.Element) -> Any:
+    if node.get("type_id") == "binary":
+        return b""
     if not len(node) and (text := (node.text or "").strip()):
         return numbers_in(text) or text
     values: dict[str, Any] = dict(node.attrib)

@@ -337,7 +337,7 @@ def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
             )
         left, right, length = fitting[0], fitting[0], None
     values = {"left": left, "right": right, "baseline_mm": length}
-    return {**left, **values, "disparity_offset_px": (offset or [None])[0]}
+    return {**left, **values, "disparity_offset_px": offset[0] if offset else None}
 
 
 def colmap(values: Values, image: Pair) -> Any:
@@ -425,20 +425,20 @@ def zed(values: Values, image: Pair) -> Values:
 def depthai(values: Values, image: Pair) -> Values:
     """Read DepthAI's calibration: left, right and other cameras. Lengths are in cm."""
     data = values["cameraData"]
-    pairs = data.items() if isinstance(data, Mapping) else data
     cameras = {
         int(key): {**each, "fisheye": each.get("cameraType") == 1}
-        for key, each in pairs
+        for key, each in (data.items() if isinstance(data, Mapping) else data)
         if any(numbers_in(each["intrinsicMatrix"]))
     }
     rig = values.get("stereoRectificationData", {})
     ends = [rig.get(f"{side}CameraSocket", -1) for side in ("left", "right")]
     ends = ends if {*ends} <= {*cameras} else [1, 2]
+    moves = [cameras.get(end, {}).get("extrinsics", {}) for end in ends]
     lengths = [
         math.hypot(*numbers_in(move.get(name)))
-        for start, end in (ends, ends[::-1])
-        if (move := cameras.get(start, {}).get("extrinsics", {})).get("toCameraSocket") == end
+        for move in moves
         for name in ("translation", "specTranslation")
+        if move.get("toCameraSocket") in ends
     ]
     names = dict(zip(ends, ("left", "right"), strict=True))
     found: dict[Any, Any] = {names.get(key, key): each for key, each in cameras.items()}
