@@ -538,6 +538,9 @@ def test_a_baseline_has_the_unit_of_its_name_or_program(name: str, tmp_path: Pat
     found = load(tmp_path, PAIRS[name])
     assert (found.camera0, found.camera1) == (CAMERA, RIGHT)
     assert found.baseline_mm == pytest.approx(120)
+    found.save(tmp_path / "calib.json")
+    again = Calibration.load(tmp_path / "calib.json")
+    assert (again.camera0, again.camera1, again.baseline_mm) == (CAMERA, RIGHT, found.baseline_mm)
 
 
 def test_a_baseline_that_may_be_in_any_unit_is_told(tmp_path: Path) -> None:

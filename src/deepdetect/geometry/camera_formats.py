@@ -12,6 +12,7 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -90,6 +91,7 @@ class Format(NamedTuple):
     first: float | Literal["middle", "fractions"] | None = None
 
 
+@lru_cache(maxsize=1000)
 def short(key: Any) -> str:
     """Return a name in lower case, without blanks, underscores and the word camera at its start."""
     return re.sub(r"[_ ]|^cam(era)?[_ ]?(?=[a-z])(?!era)", "", str(key).lower())
