@@ -5,6 +5,7 @@ The georeference is that of a GeoTIFF or a world file, read by rasterio.
 
 from __future__ import annotations
 
+import re
 import struct
 import warnings
 from collections.abc import Iterator
@@ -27,6 +28,12 @@ from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
 """Tags of GeoTIFF for pixel scale and transformation. A georeferenced TIFF has one of them."""
+
+PLACES = re.compile(rb"<Geo(Transform|dataXform)>|<GCPList|gml\.data|\xb1\x4b\xf8\xbd\x08\x3d\x4b\x43")
+"""Marks of places in GDAL's files .aux.xml and in the headers of JPEG 2000 files."""
+
+MAX_HEADER_BYTES = 1 << 20
+"""Marks of places are sought in this number of bytes; the pixels of large files follow."""
 
 NO_MATRIX = "the place of an image is not kept, since no affine matrix that GDAL reads states it: \
 warp an image with ground control points or RPCs by gdalwarp first"
@@ -237,6 +244,9 @@ def _read_place(path: Path, page: Any, orientation: int) -> dict[str, Any]:
     beside = {each.suffix.lower(): each for each in files if each.stem.lower() == stem}
     tagged = page is not None and {PIXEL_SCALE, TRANSFORMATION} & {*page.tags.keys()}
     stated = bool(tagged or beside.keys() & {*_world_endings(path)})
+    for each in (path, path.with_name(f"{path.name}.aux.xml")):
+        with suppress(OSError), each.open("rb") as file:
+            stated |= PLACES.search(file.read(MAX_HEADER_BYTES)) is not None
     if stated:
         require_packages(f"the georeference of {path}", "rasterio")
     name = str(path.absolute())  # GDAL may read `a:b` as DRIVER:FILE

@@ -54,13 +54,14 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
         return _parsed(line.strip() for line in lines if line.strip())
-    except OSError as error:
-        raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
+    except (OSError, UnicodeError) as error:
+        why = f"({first_line(error)}): check the path, and save it as text in UTF-8"
+        raise OptionError(f"{path} cannot be read {why}") from None
     except Exception as error:  # an error of pyproj, or text in place of numbers
         raise OptionError(
             f"{path} is not a file of ground control points ({first_line(error)}): the first line "
             "must be the coordinate system, such as EPSG:32633, and each other line 'x y z column "
-            "row image', unless a header states another order"
+            "row image' with x to the east, unless a header states another order"
         ) from None
 
 
@@ -77,7 +78,7 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
         elif system and line[0] != "#":
             rows.append(_in_order(words, order))
         elif line[0] != "#":
-            system = line.strip("'\"")
+            system = line.rstrip(",;").strip("'\"")
     if zone := re.fullmatch(r"WGS84 UTM (\d+)([NS]?)", system.upper()):
         system = f"EPSG:{(32700 if zone[2] == 'S' else 32600) + int(zone[1])}"
     crs = CRS.from_user_input(system)
@@ -124,5 +125,7 @@ def _in_order(words: list[str], order: list[str]) -> list[str]:
     ends = (k for k in range(at, len(words)) if words[k].lower().endswith(IMAGE_SUFFIXES))
     end = next(ends, at) + 1
     words = [*words[:at], " ".join(words[at:end]), *words[end:]]
+    if len(words) < last:
+        raise ValueError(f"a line has {len(words)} columns, and {last} are needed")
     fields = dict(zip(order, [*words[:last], " ".join(words[last:])], strict=True))
     return [fields.get(column, "") for column in COLUMNS]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import NoPlaceError, OptionError, ReconstructionError
-from ..geometry.camera import PosedView
+from ..geometry.camera import PosedView, cross_matrix
 from ..geometry.similarity import (
     MUCH_BETTER,
     WRONG_STDS,
@@ -66,8 +66,7 @@ MAX_DISTANCE_PX = 15.0
 projects to within this distance of the pixel. Chosen by hand."""
 
 MAX_BEND = 0.05
-"""A bent model has residuals of up to this share of the extent of its points; a mistake in the
-control points mostly makes larger ones. Chosen by hand."""
+"""A bent model has residuals of up to this share of the extent of its points. Chosen by hand."""
 
 READINGS: dict[str, tuple[list[int], float]] = {
     "heights are in feet": ([0, 1, 2], 0.3048),
@@ -307,7 +306,7 @@ def _check_control_points(
     """Raise a NoPlaceError if control points contradict a model, or fit better if read otherwise.
 
     They contradict it if most residuals exceed what the accuracy of the targets, the `error` of the
-    points in the model, and a bend of the model explain.
+    points in the model, and a bend of the model explain. A bend is told.
     """
     own, names = np.array([*points.values()]), [*points]
 
@@ -316,13 +315,16 @@ def _check_control_points(
         relative = away / np.hypot(known["accuracy"], found.similarity.scale * error) / factor
         return away, relative, float((np.minimum(relative, WRONG_STDS) ** 2).sum())
 
-    likely, worst, cost = CAUSES, "", len(names) * WRONG_STDS**2
+    likely, worst, cost, bent = CAUSES, "", len(names) * WRONG_STDS**2, False
     if fit is not None:
         away, relative, cost = misfit(fit)
         for k in np.argsort(-away)[:MIN_FIXES]:
             worst += f", {names[k]} by {away[k]:.3g} m"
-        bent = np.median(away) < MAX_BEND * np.nan_to_num(targets).std(axis=0).max()
-        likely = "" if bent or np.median(relative) < WRONG_STDS else CAUSES
+        # Three points always agree, so more than these must outnumber those that do not.
+        few = 2 * (relative > WRONG_STDS).sum() <= len(names) - MIN_FIXES
+        agreed = few and np.median(relative) < WRONG_STDS
+        bent = not agreed and _is_bent(fit, targets)
+        likely = "" if agreed or bent else CAUSES
     for reading, (axes, factor) in READINGS.items() if cost > len(names) else ():
         with suppress(ReconstructionError):
             other = fit_similarity(own, targets[:, axes] * [1, 1, factor], **known)
@@ -330,6 +332,32 @@ def _check_control_points(
                 likely = f"whether {reading}, which fits far better"
     if likely:
         raise NoPlaceError(f"the ground control points contradict the model{worst}: check {likely}")
+    if bent:
+        text = f"the model is bent and misses ground control points{worst}: calibrate the camera"
+        warnings.warn(f"{text}, or add images that look obliquely", UserWarning, stacklevel=2)
+
+
+def _is_bent(fit: SimilarityFit, targets: np.ndarray) -> bool:
+    """Return whether a bend that grows with the squared distance explains most residuals.
+
+    Each point is compared with what the others predict, so errors at random are no bend.
+    """
+    known = np.isfinite(targets[:, 2])
+    at, residuals = targets[known], fit.residuals[known]
+    moves = np.tile(np.eye(3), (len(at), 1, 1))
+    turns = np.array([cross_matrix(row) for row in at]).reshape(-1, 3, 3)
+    bends = (at[:, :2] ** 2).sum(axis=1)[:, None, None] * np.eye(3)
+    terms = np.concatenate([moves, turns, at[:, :, None], bends], axis=2)
+    misses = []
+    for used in (terms[:, :, :7], terms):
+        left = residuals.copy()
+        for k in range(len(at)):
+            others = np.arange(len(at)) != k
+            matrix = used[others].reshape(-1, used.shape[2])
+            left[k] -= used[k] @ np.linalg.lstsq(matrix, residuals[others].ravel())[0]
+        misses.append(np.median(np.linalg.norm(left, axis=1)))
+    straight, bent = misses
+    return bool(straight < MAX_BEND * at.std(axis=0).max() and bent < MUCH_BETTER * straight)
 
 
 def upright(
@@ -382,15 +410,17 @@ def _seen_by_several(
     """Return the control points that are marked in two or more of the named images.
 
     `names` maps image names in the file to full names. The result is by point, then by full name.
+    One place is one point, because names may have remarks on the mark behind them.
     """
-    seen: dict[str, dict[str, ControlRow]] = {}
+    rows: dict[str, dict[str, ControlRow]] = {}
+    place_of: dict[str, str] = {}
     for row in control:
         if row.image in names:
-            rows = seen.setdefault(row.name, {})
-            rows[names[row.image]] = row
-            if not np.array_equal(row.place, next(iter(rows.values())).place, equal_nan=True):
+            place = str(row.place)  # as text, NaN is equal to itself
+            rows.setdefault(place, {})[names[row.image]] = row
+            if place_of.setdefault(row.name, place) != place:
                 raise NoPlaceError(f"{row.name} is the name of two control points: change one")
-    seen = {name: rows for name, rows in seen.items() if len(rows) > 1}
+    seen = {next(iter(each.values())).name: each for each in rows.values() if len(each) > 1}
     if len(seen) < MIN_FIXES:
         raise OptionError(
             f"{len(seen)} ground control points are marked in two or more images of the model, but "
