@@ -120,14 +120,14 @@ def mosaics(generator: np.random.Generator, folder: Path) -> None:
     with rasterio.open(raster) as file:
         count = file.count
     right = scene[:, shift:]
-    if count in (1, 3, 4):
+    if count in (1, 3):
         Image.fromarray(right).save(other)
     else:
         with rasterio.open(
             other := folder / "b.tif", "w", "GTiff", *right.shape[::-1], count, dtype="uint8"
         ) as file:
             file.write(np.array([right] * count))
-    bands = [] if count in (1, 3, 4) else ["--bands", "1", "2", "1"]
+    bands = [] if count in (1, 3) else ["--bands", "1", "2", "1"]
     words = [str(raster), str(other), "--detector", "points", "--value-range", "0", "255", *bands]
     if generator.random() < 0.5:
         union = ["--extent", "union"] if generator.random() < 0.5 else []

@@ -323,7 +323,7 @@ def _check_control_points(
         # Three points always agree, so more than these must outnumber those that do not.
         few = 2 * (relative > WRONG_STDS).sum() <= len(names) - MIN_FIXES
         agreed = few and np.median(relative) < WRONG_STDS
-        bent = not agreed and _is_bent(fit, targets)
+        bent = cost > len(names) and _is_bent(fit, targets)
         likely = "" if agreed or bent else CAUSES
     for reading, (axes, factor) in READINGS.items() if cost > len(names) else ():
         with suppress(ReconstructionError):
