@@ -22,22 +22,16 @@ MAX_SAMPLES = 500
 the same number of pairs. Chosen by hand."""
 
 MAX_START_TILT_DEG = 60.0
-"""A similarity fitted to three points may tilt the known upward direction away from the z axis by
-at most this angle, because three points that lie nearly on a line can give any tilt."""
+"""A similarity of three points may tilt the known upward direction away from the z axis by at most
+this angle, because three points that lie nearly on a line can give any tilt."""
 
-MIN_AREA_POINTS, MIN_AREA = 8, 0.2
-"""The points can overrule the known upward direction only if there are at least MIN_AREA_POINTS,
-and their second principal axis is above MIN_AREA times as long as the first. Chosen by hand."""
+MIN_AREA_POINTS, MIN_AREA, MUCH_BETTER = 8, 0.2, 0.5
+"""Points can overrule the known upward direction only if there are MIN_AREA_POINTS, their second
+principal axis is above MIN_AREA times as long as the first, and the median distance from the
+targets falls below MUCH_BETTER of what it was. Chosen by hand."""
 
-MUCH_BETTER = 0.5
-"""The known upward direction is overruled only if tilting it by more than `MAX_START_TILT_DEG`
-reduces the median distance from the targets to below this fraction. Chosen by hand."""
-
-HUBER_STDS = 2.0
-"""Residuals larger than this number of standard deviations get less weight. Chosen by hand."""
-
-WRONG_STDS = 5.0
-"""A point with a residual above this many standard deviations gets no weight. Chosen by hand."""
+HUBER_STDS, WRONG_STDS = 2.0, 5.0
+"""Residuals above these numbers of standard deviations get less weight, or none. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
 """The stated accuracy of the targets counts as much as this number of residuals, because a few
@@ -132,11 +126,7 @@ def fit_similarity(
         stds = _spread(residuals[~wrong], known[~wrong], accuracy)
         weights = np.where(wrong, 0, np.minimum(1, HUBER_STDS / np.maximum(away, 1e-12)))
         turned = current.scale * (own @ current.rotation.T)
-        jacobian = np.zeros((len(points), 3, 7))
-        jacobian[:, :, :3] = np.eye(3)
-        jacobian[:, :, 3:6] = [-cross_matrix(row) for row in turned]
-        jacobian[:, :, 6] = turned
-        jacobian *= (known / stds)[:, :, None]
+        jacobian = changes(turned) * (known / stds)[:, :, None]
         weighted = jacobian * weights[:, None, None]
         of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
         right = np.einsum("nai,na->i", weighted, residuals / stds)
@@ -169,6 +159,13 @@ def fit_similarity(
         np.degrees(deviations[3:6]).clip(max=180),
         min(float(np.degrees(widest)), 180.0),
     )
+
+
+def changes(points: np.ndarray) -> np.ndarray:
+    """Return how points (N, 3) change (N, 3, 7) by a shift, a small rotation and a small scale."""
+    moves = np.tile(np.eye(3), (len(points), 1, 1))
+    turns = np.reshape([-cross_matrix(row) for row in points], (-1, 3, 3))
+    return np.concatenate([moves, turns, points[:, :, None]], axis=2)
 
 
 def _search(

@@ -126,6 +126,6 @@ def _in_order(words: list[str], order: list[str]) -> list[str]:
     end = next(ends, at) + 1
     words = [*words[:at], " ".join(words[at:end]), *words[end:]]
     if len(words) < last:
-        raise ValueError(f"a line has {len(words)} columns, and {last} are needed")
+        raise ValueError(f"a line has fewer than {last} columns")
     fields = dict(zip(order, [*words[:last], " ".join(words[last:])], strict=True))
     return [fields.get(column, "") for column in COLUMNS]
