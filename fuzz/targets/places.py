@@ -146,7 +146,11 @@ def mosaics(generator: np.random.Generator, folder: Path) -> None:
         return
     (made,) = [
         *folder.glob("out/b_on_a.[pt][ni][gf]"),
-        *(each for each in folder.glob("[pP].*") if each.suffix.lower() in (".tif", ".png", ".jpg")),
+        *(
+            each
+            for each in folder.glob("[pP].*")
+            if each.suffix.lower() in (".tif", ".png", ".jpg")
+        ),
     ]
     with rasterio.open(made) as file:
         values = file.read(1).astype(float)

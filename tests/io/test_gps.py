@@ -135,7 +135,12 @@ def test_what_altitudes_refer_to(reference: int | None, sign: int, tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("version", "reference", "expected"),
-    [(b"0232", 0, "sea"), (b"0300", 0, "ellipsoid"), (b"0300", 1, "ellipsoid"), (b"0300", 3, "sea")],
+    [
+        (b"0232", 0, "sea"),
+        (b"0300", 0, "ellipsoid"),
+        (b"0300", 1, "ellipsoid"),
+        (b"0300", 3, "sea"),
+    ],
 )
 def test_heights_of_exif_3(version: bytes, reference: int, expected: str, tmp_path: Path) -> None:
     exif = Image.Exif()
@@ -146,7 +151,7 @@ def test_heights_of_exif_3(version: bytes, reference: int, expected: str, tmp_pa
     fix = read_gps(tmp_path / "a.jpg")
     assert fix is not None
     assert expected in fix.reference
-    assert fix.altitude == (5 if reference == 0 else -5)
+    assert fix.altitude == (-5 if reference in (1, 3) else 5)
 
 
 def test_degrees_without_minutes_or_seconds(tmp_path: Path) -> None:

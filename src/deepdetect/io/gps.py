@@ -97,7 +97,7 @@ def read_gps(path: Path) -> GpsFix | None:
 
 def _gravity(drone: dict[str, float]) -> np.ndarray | None:
     """Compute `GpsFix.gravity` from roll and pitch of the gimbal in degrees; pitch -90 is down."""
-    angles = drone.get("GimbalPitchDegree", np.nan), drone.get("GimbalRollDegree", np.nan)
+    angles = [drone.get(f"Gimbal{name}Degree", np.nan) for name in ("Pitch", "Roll")]
     if not max(map(abs, angles)) <= MAX_GRAVITY_TILT_DEG:
         return None
     pitch, roll = np.radians(angles)

@@ -29,11 +29,9 @@ from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
 """Tags of GeoTIFF for pixel scale and transformation. A georeferenced TIFF has one of them."""
 
-PLACES = re.compile(rb"<Geo(Transform|dataXform)>|<GCPList|gml\.data|\xb1\x4b\xf8\xbd\x08\x3d\x4b\x43")
-"""Marks of places in GDAL's files .aux.xml and in the headers of JPEG 2000 files."""
-
+PLACES = re.compile(rb"<GeoTransform>|<GeodataXform|<GCPList|gml\.data|\xb1\x4b\xf8\xbd\x08\x3d")
 MAX_HEADER_BYTES = 1 << 20
-"""Marks of places are sought in this number of bytes; the pixels of large files follow."""
+"""Marks of places in .aux.xml and at the start of JPEG 2000 files, and the bytes to search."""
 
 NO_MATRIX = "the place of an image is not kept, since no affine matrix that GDAL reads states it: \
 warp an image with ground control points or RPCs by gdalwarp first"

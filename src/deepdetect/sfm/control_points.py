@@ -45,10 +45,10 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
     """Read a file of ground control points in the format of OpenDroneMap.
 
     The first line names the coordinate system, such as "EPSG:32633", "EPSG:2249+6360" or "WGS84 UTM
-    33N". Each other line is `x y z column row image [name]`: a point's coordinates, its pixel in an
-    image, the name of the image, and perhaps that of the point, separated by blanks, tabs, commas
-    or semicolons. A header may state another order. The system also gives the unit of heights: that
-    of its vertical axis, else that of x and y, or metres if these are degrees.
+    33N". Each other line is `x y z column row image [name]`: a point's coordinates, x to the east,
+    and its pixel in an image, separated by blanks, tabs, commas or semicolons. A header may state
+    another order. Heights have the unit of the system's vertical axis, else of x and y, or metres
+    if these are degrees.
     """
     require_packages("a file of ground control points", "pyproj")
     try:

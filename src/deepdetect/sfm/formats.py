@@ -92,8 +92,8 @@ def write_map(found: MultiViewReconstruction, folder: Path, output: Path) -> Non
     to_world = np.array([[cell, 0, corner[0]], [0, -cell, corner[1]], [0, 0, 1.0]])
     place = Metadata(to_world, f"EPSG:{epsg}")
     replace(place, no_data=np.nan).write_tiff(heights, output / "height.tif")
-    photo = photo.reshape(height, width, 3)
-    replace(place, no_data=0).write_tiff(photo, output / "orthophoto.tif")
+    bands = photo.reshape(height, width, 3)
+    replace(place, no_data=0).write_tiff(bands, output / "orthophoto.tif")
 
 
 def _in_utm(found: MultiViewReconstruction, what: str) -> tuple[np.ndarray, int]:

@@ -32,11 +32,9 @@ from .mapping import SparseModel
 
 __all__ = ["ControlRow", "Georeference", "Origin", "georeference", "read_control_points"]
 
-GPS_ACCURACY_M = 3.0
-"""Assumed accuracy of GPS positions that state none. Usual receivers reach it in the open."""
-
-CONTROL_ACCURACY_M = 0.1
-"""Assumed accuracy of control points: surveyed to centimetres, marked to within a few pixels."""
+GPS_ACCURACY_M, CONTROL_ACCURACY_M = 3.0, 0.1
+"""Assumed accuracies: of GPS positions that state none, as usual receivers reach it in the open,
+and of control points, surveyed to centimetres and marked to within a few pixels."""
 
 MAX_SCALE_STD, MAX_HEADING_STD_DEG = 0.25, 20.0
 """The relative standard deviation of a georeferenced model's scale, and the standard deviation of
@@ -194,12 +192,11 @@ def require_fixes(folder: Path, what: str) -> None:
 
 
 def require_images(
-    names: Iterable[str],
+    names: Collection[str],
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
     """Raise an OptionError if `scale_by` names no image, or images show too few control points."""
-    names = [*names]
     named = {Path(name).name: name for name in names} | {name: name for name in names}
     if control is not None:
         _seen_by_several(control, named)
@@ -213,8 +210,7 @@ def georeference_by_gps(
 ) -> Georeference:
     """Find the place of a model by the GPS positions of its images, which are below a folder.
 
-    `scale` is in metres per unit of the model, or None if it is unknown. If no place is found, a
-    ReconstructionError says why.
+    `scale` is in metres per unit, if known. If no place is found, a ReconstructionError says why.
     """
     fixes = {name: fix for name in views if (fix := read_gps(folder / name)) is not None}
     if len(fixes) < MIN_POINTS:
@@ -333,6 +329,8 @@ def _is_bent(fit: SimilarityFit, targets: np.ndarray) -> bool:
     """
     known = np.isfinite(targets[:, 2])
     at, residuals = targets[known], fit.residuals[known]
+    if len(at) < MIN_POINTS:
+        return False
     moves = changes(at)
     bends = (at[:, :2] ** 2).sum(axis=1)[:, None, None] * np.eye(3)
     misses = []
@@ -391,10 +389,10 @@ def georeference_by_control_points(
 def _seen_by_several(
     control: Sequence[ControlRow], names: Mapping[str, str]
 ) -> dict[str, dict[str, ControlRow]]:
-    """Return the control points that are marked in two or more of the named images.
+    """Return the control points marked in two or more of the images, by name, then by image.
 
-    `names` maps image names in the file to full names. The result is by point, then by full name.
-    One place is one point, because names may have remarks on the mark behind them.
+    `names` maps image names in the file to full names. One place is one point, because remarks on
+    the mark may follow its name.
     """
     rows: dict[str, dict[str, ControlRow]] = {}
     place_of: dict[str, str] = {}
@@ -439,8 +437,8 @@ def scale_by_distance(
 ) -> float:
     """Return the metres per unit of a model, from the known distance between two places in it.
 
-    An end is the name of an image, for the position of its camera, or NAME:X,Y, for the one of the
-    `points` (N, 3) that this pixel of the image shows.
+    An end is the NAME of an image, for its camera, or NAME:X,Y, for the point of `points` (N, 3)
+    that this pixel shows.
     """
     one, other = (_end(end, sparse, points) for end in (end0, end1))
     length = float(np.linalg.norm(one - other))
@@ -450,17 +448,11 @@ def scale_by_distance(
 
 
 def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
-    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", end)
-    names, name = _by_file_name(sparse.images), pixel[1] if pixel else end
-    if name not in names:
-        raise OptionError(
-            f"{name} is not an image of the model: name two of its images, or pixels in images as "
-            "NAME:X,Y"
-        )
-    image = sparse.images[names[name]]
+    name, pixel = _image_and_pixel(end, _by_file_name(sparse.images))
+    image = sparse.images[name]
     if pixel is None:
         return image.view.centre
-    xy = image.intrinsics.to_pinhole(np.array([[float(pixel[2]), float(pixel[3])]]))
+    xy = image.intrinsics.to_pinhole(pixel[None])
     projected, depth = image.view.project(points)
     distances = np.where(depth > 0, np.linalg.norm(projected - xy, axis=1), np.inf)
     if not (len(points) and distances.min() < MAX_DISTANCE_PX):
@@ -471,3 +463,15 @@ def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
     # The point nearest to the camera hides others that are about equally close to the pixel.
     near = np.flatnonzero(distances < distances.min() + 2)
     return np.asarray(points[near[depth[near].argmin()]], np.float64)
+
+
+def _image_and_pixel(end: str, names: Mapping[str, str]) -> tuple[str, np.ndarray | None]:
+    """Return the image that an end of a distance names, and its pixel (None if none is given)."""
+    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", end)
+    name = pixel[1] if pixel else end
+    if name not in names:
+        raise OptionError(
+            f"{name} is not an image of the model: name two of its images, or pixels in images as "
+            "NAME:X,Y"
+        )
+    return names[name], np.array([float(pixel[2]), float(pixel[3])]) if pixel else None
