@@ -323,6 +323,21 @@ def test_errors_at_random_are_no_bend_in_a_model_of_any_size(
         georeference(sparse, sparse.points, tmp_path, control)
 
 
+def test_a_model_across_the_antimeridian(pycolmap, tmp_path: Path, hidden: Similarity) -> None:
+    sparse, marks, _, shown = surveyed(hidden)
+    fiji = Origin(-17.0, 179.9997, 10.0)
+    places = marks @ np.diag([1 / 106_000, 1 / 110_650, 1]) + [fiji.longitude, fiji.latitude, 10]
+    places[:, 0] -= 360 * (places[:, 0] > 180)
+    assert 0 < (places[:, 0] < 0).sum() < len(places)
+    control = read_control_points(survey_file(tmp_path / "g.txt", "EPSG:4326", places, shown))
+    found = georeference(sparse, sparse.points, tmp_path, control)
+    assert isinstance(found, Georeference)
+    assert found.origin is not None
+    assert abs(found.origin.longitude) == pytest.approx(180, abs=0.001)
+    assert found.similarity.scale == pytest.approx(hidden.scale, rel=0.01)
+    assert tilt_error_deg(found.similarity, hidden) < 1
+
+
 def test_remarks_behind_names_make_no_further_points(
     pycolmap, tmp_path: Path, hidden: Similarity
 ) -> None:

@@ -93,7 +93,7 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
     # Zones are used beyond their borders, so the place may be as far off as the area is large.
     if area := crs.area_of_use:
         width = (area.east - area.west) % 360 or 360
-        aside = (np.median(longitude) - area.west + width) % 360
+        aside = np.median((longitude - area.west + width) % 360)
         above = abs(2 * np.median(latitude) - area.north - area.south)
         if aside > 3 * width or above > 3 * (area.north - area.south):
             text = f"the ground control points are far from where {crs.name} is used: check the "

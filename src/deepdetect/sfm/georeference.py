@@ -68,8 +68,7 @@ that correct each one."""
 
 CAUSES = "the units, the order of the columns, the coordinate system, and the names of the images"
 
-NEARLY_A_LINE = "the positions lie nearly on a line: the rotation of the model about this line \
-follows from the assumption that the cameras are held upright"
+NEARLY_A_LINE = "the positions lie nearly on a line: that the cameras are held upright is assumed"
 
 
 @dataclass(frozen=True)
@@ -104,10 +103,8 @@ class Georeference:
 
     Attributes:
         similarity: similarity from the frame of the mapping to the world.
-        source: "GPS", "ground control points", or "known distance", which gives a scale but no
-            place.
-        origin: origin of the world, whose axes point east, north and up; None if only the scale is
-            known.
+        source: "GPS", "ground control points", or "known distance", which gives only a scale.
+        origin: that of the world, whose axes point east, north and up; None for a known distance.
         residuals: given position minus position in the model, (3,) in metres east, north and up, by
             name of the image (GPS) or of the control point.
         wrong: images or control points that were left out, because they contradict the others.
@@ -197,7 +194,7 @@ def require_images(
     scale_by: tuple[float, str, str] | None,
 ) -> None:
     """Raise an OptionError if `scale_by` names no image, or images show too few control points."""
-    named = {Path(name).name: name for name in names} | {name: name for name in names}
+    named = _by_file_name(names)
     if control is not None:
         _seen_by_several(control, named)
     if scale_by is not None:
@@ -258,8 +255,9 @@ def _place(
     """Fit a model to places; `error` is that of control points in the model, in its unit."""
     unknown = np.isnan(places[:, 2])
     places = np.where(np.isnan(places), 0 if unknown.all() else np.nanmedian(places[:, 2]), places)
+    places[:, 1] = np.unwrap(places[:, 1], period=360)
     latitude, longitude, height = np.median(places, axis=0).tolist()
-    origin = Origin(round(latitude, 6), round(longitude, 6), round(height, 1))
+    origin = Origin(round(latitude, 6), round((longitude + 180) % 360 - 180, 6), round(height, 1))
     targets = origin.to_enu(places)
     targets[unknown, 2] = np.nan
     own = np.array([*points.values()])

@@ -80,7 +80,10 @@ def _better_places(
         partners = _partners(pycolmap, opened, points.seen)
         for number in points.seen:
             bar.update()
-            matches = [(other, _matches(opened, number, other)) for other in partners[number]]
+            matches = (
+                (other, opened.read_two_view_geometry(number, other).inlier_matches)
+                for other in partners[number]
+            )
             keypoints, rows = points.matched(number, matches)
             image, places = model.images[number], points.xyz[rows]
             xy = points.keypoints[number][keypoints]
@@ -135,7 +138,8 @@ class _Points:
         lengths = np.linalg.norm(sums, axis=1) / np.maximum(counts, 1)
         well = (counts > 1) & (lengths < np.cos(np.radians(MIN_SPREAD_DEG)))
         found = [np.empty(0, np.int64)]
-        for other, pairs in matches:
+        for other, inliers in matches:
+            pairs = np.asarray(inliers, np.int64).reshape(-1, 2)
             rows = self.seen[other][pairs[:, 1]]
             kept = (rows >= 0) & well[rows]
             found.append(pairs[kept, 0] * len(self.xyz) + rows[kept])
@@ -152,12 +156,6 @@ def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int,
             partners[first].append(second)
             partners[second].append(first)
     return partners
-
-
-def _matches(database: Any, number: int, other: int) -> np.ndarray:
-    """Return the inlier matches of two images, (M, 2) indices of keypoints."""
-    matches = database.read_two_view_geometry(number, other).inlier_matches
-    return np.asarray(matches, np.int64).reshape(-1, 2)
 
 
 def _agreeing(camera: Any, xy: np.ndarray, points: np.ndarray, pose: Any) -> int:
