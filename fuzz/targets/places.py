@@ -47,6 +47,11 @@ def random_transform(generator: np.random.Generator) -> Any:
     return shift * rasterio.Affine.rotation(angle) * rasterio.Affine.scale(x, y)
 
 
+def as_bands(values: np.ndarray, count: int) -> np.ndarray:
+    """Repeat values in all bands, but for the fourth: GDAL makes it alpha."""
+    return np.array([values, values, values, np.full_like(values, 255), values, values][:count])
+
+
 def write_raster(generator: np.random.Generator, stem: Path, values: np.ndarray) -> Path:
     """Write grey values, (H, W) uint8, to a raster of any kind that GDAL places somewhere."""
     import rasterio
@@ -60,7 +65,7 @@ def write_raster(generator: np.random.Generator, stem: Path, values: np.ndarray)
         how |= {"nodata": 0} if generator.random() < 0.3 else {}
         path = stem.with_suffix(".tif")
         with rasterio.open(path, "w", dtype=dtype, crs=system, transform=transform, **how) as file:
-            file.write(np.array([values.astype(dtype)] * count))
+            file.write(as_bands(values, count).astype(dtype))
             if generator.random() < 0.3:
                 file.update_tags(AREA_OR_POINT="Point")
         return path
@@ -126,7 +131,7 @@ def mosaics(generator: np.random.Generator, folder: Path) -> None:
         with rasterio.open(
             other := folder / "b.tif", "w", "GTiff", *right.shape[::-1], count, dtype="uint8"
         ) as file:
-            file.write(np.array([right] * count))
+            file.write(as_bands(right, count))
     bands = [] if count in (1, 3) else ["--bands", "1", "2", "1"]
     words = [str(raster), str(other), "--detector", "points", "--value-range", "0", "255", *bands]
     if generator.random() < 0.5:
