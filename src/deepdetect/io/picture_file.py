@@ -30,6 +30,10 @@ from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
 """Tags of GeoTIFF for pixel scale and transformation. A georeferenced TIFF has one of them."""
 
+PLACES = re.compile(rb"<GeoTransform>|<GeodataXform|<GCPList|gml\.data|\xb1\x4b\xf8\xbd\x08\x3d")
+MAX_HEADER_BYTES = 1 << 20
+"""Marks of places in .aux.xml and at the start of JPEG 2000 files, and the bytes to search."""
+
 NO_MATRIX = "the place of an image is not kept, since no affine matrix that GDAL reads states it: \
 warp an image with ground control points or RPCs by gdalwarp first"
 NO_SYSTEM = "a GeoTIFF without a coordinate system keeps its place as that of a local grid: assign \
@@ -271,6 +275,9 @@ def _read_place(path: Path, page: Any, orientation: int) -> dict[str, Any]:
     beside = {each.suffix.lower(): each for each in files if each.stem.lower() == stem}
     tagged = page is not None and {PIXEL_SCALE, TRANSFORMATION} & {*page.tags.keys()}
     stated = bool(tagged or beside.keys() & {*_world_endings(path)})
+    for each in (path, path.with_name(f"{path.name}.aux.xml")):
+        with suppress(OSError), each.open("rb") as file:
+            stated |= PLACES.search(file.read(MAX_HEADER_BYTES)) is not None
     if stated:
         require_packages(f"the georeference of {path}", "rasterio")
     name = str(path.absolute())  # GDAL may read `a:b` as DRIVER:FILE
