@@ -160,16 +160,17 @@ def _compare_details(grays: Pair, homography: np.ndarray, copy: np.ndarray) -> n
 def _preferred(compared: np.ndarray, distinct: bool = False) -> bool:
     """Return whether (3, ...) ZNCCs of `_compare` prefer a homography to its copy.
 
-    Content that recurs one shift away in the first image is no evidence for the homography: where
-    the pattern ends, its next period may just be hidden.
+    Content that recurs one shift away in the first image is no evidence for either: where the
+    pattern ends, or something covers it, its next period may just be hidden.
     """
     own, others, recurring = compared
-    recurs = (recurring > MIN_ZNCC) & (recurring > own - MIN_ZNCC_GAIN)
-    explained = np.fmax(own, others) > MIN_ZNCC  # False where both are NaN
-    known = explained & np.isfinite(own) & np.isfinite(others)
+    best = np.fmax(own, others)  # NaN where both are
+    known = (best > MIN_ZNCC) & np.isfinite(own) & np.isfinite(others)
+    recurs = (recurring > MIN_ZNCC) & (recurring > best - MIN_ZNCC_GAIN)
     gain = (own - others)[known]
-    alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
-    other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
+    alone, other_alone = (
+        np.sum((sign * gain > MIN_ZNCC_GAIN) & ~recurs[known]) for sign in (1, -1)
+    )
     if len(gain) < MIN_COMPARED:
         # With so few places, the distinctive descriptors of sparse matches suffice if enough of
         # their patches look alike and the copy alone explains no place.
