@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -14,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from .._shared.errors import ImageError, OptionError, RegistrationError, noted_failures
+from .._shared.errors import ImageError, OptionError, noted_failures
 from .._shared.image_array import array_to_rgb
 from .._shared.progress import StageTimer, progress, stage_progress
 from ..batch.pair_list import list_pairs
@@ -392,27 +390,16 @@ def stitch(
         raise ImageError(f"there is no panorama, because {what}: {'; '.join(failures)}")
     cli.check_outputs([file], paths)
 
-    def named(text: object) -> str:  # has indices in place of names
-        return re.sub(r"images\[(\d+)\]", lambda found: str(images[int(found[1])]), str(text))
-
     with cli.writing({"file": file}, images, overwrite) as made:
-        try:
-            with (
-                stage_progress("stitching", stages_of(len(images))) as done,
-                warnings.catch_warnings(record=True, action="always") as caught,
-            ):
-                panorama = stitch_images(
-                    images,
-                    detector=chosen,
-                    reference=None if reference is None else images.index(reference),
-                    options=options,
-                    progress=done,
-                    **values,
-                )
-        except (OptionError, RegistrationError) as error:
-            raise type(error)(named(error)) from error
-        for warning in caught:
-            warnings.warn(named(warning.message), warning.category, stacklevel=2)
+        with stage_progress("stitching", stages_of(len(images))) as done:
+            panorama = stitch_images(
+                images,
+                detector=chosen,
+                reference=None if reference is None else images.index(reference),
+                options=options,
+                progress=done,
+                **values,
+            )
         moved = panorama.homographies[panorama.reference] if flat else None
         kept, image = carried[panorama.reference].moved(moved), panorama.image
         if kept.no_data is not None and kept.no_data in range(np.iinfo(image.dtype).max + 1):

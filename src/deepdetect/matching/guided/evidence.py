@@ -135,7 +135,10 @@ def is_repeated(
         copy = scaled_homography(other, 1 / scale0, 1 / scale1)
         if sparse and _parallax_decides(first, scale0, sparse, homography, copy, seed):
             continue
-        if not _preferred(_compare_details(grays, homography, copy)):
+        (large0, by0), (large1, by1) = (downscale(gray, DETAILED_SIDE_PX) for gray in grays)
+        own, other = (scaled_homography(each, by0, by1) for each in (homography, copy))
+        other = refine_homography(large0, large1, other)
+        if not _preferred(_compare(large0, large1, own, other)):
             return True
     return False
 
@@ -148,13 +151,6 @@ def _compare(
     recurring = (warped_zncc(first, first, move) for move in (step, np.linalg.inv(step)))
     own, others = (warped_zncc(first, second, each) for each in (matrix, other))
     return np.stack([own, others, np.fmax(*recurring)])
-
-
-def _compare_details(grays: Pair, homography: np.ndarray, copy: np.ndarray) -> np.ndarray:
-    """Compare a homography with its copy in larger images."""
-    (first, scale0), (second, scale1) = (downscale(gray, DETAILED_SIDE_PX) for gray in grays)
-    own, other = (scaled_homography(each, scale0, scale1) for each in (homography, copy))
-    return _compare(first, second, own, refine_homography(first, second, other))
 
 
 def _preferred(compared: np.ndarray, distinct: bool = False) -> bool:
