@@ -9,7 +9,6 @@ from PIL import Image
 from deepdetect import ImageError
 from deepdetect.io.image import find_images, name_images
 
-
 GREYS = np.arange(600, dtype=np.uint8).reshape(20, 30)
 
 

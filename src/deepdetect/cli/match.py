@@ -40,7 +40,6 @@ from ._detection import (
     POINTS,
     SELECTION,
     Detector,
-    Kind,
     chosen_detector,
 )
 
@@ -50,10 +49,7 @@ UNGUIDED = cli.From(
 )
 UNGUIDED_STAGES = ("keypoints", "matching", "geometry")
 
-GEOMETRY = cli.From(
-    GeometryOptions,
-    more="inlier_threshold confidence iterations",
-)
+GEOMETRY = cli.From(GeometryOptions, more="inlier_threshold confidence iterations")
 REGISTRATION = cli.From(register_images, "extent", more="mutual seed")
 PANORAMA = cli.From(stitch_images, "projection crop force", more="seed")
 OPTIONS = cli.From(StitchingOptions)
@@ -119,7 +115,7 @@ def match(
     match_pair: Callable[..., Matches] = match_images
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
-    stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
+    stages = UNGUIDED_STAGES if unguided else GUIDED_STAGES[detector == "points" :]
     of_pinholes = partial(_load_of_pinhole, rim=unguided)
     flat = values.get("model") == "homography"
     load = lru_cache(2)(load_pixels if flat else of_pinholes)  # successive pairs share an image
@@ -257,16 +253,11 @@ def _numbers(
     }
 
 
-def _guided_stages(detector: Kind) -> tuple[str, ...]:
-    return GUIDED_STAGES[1:] if detector == "points" else GUIDED_STAGES
-
-
 def _geometry_values(geometry: TwoViewGeometry | None) -> dict[str, Any] | None:
     if geometry is None:
         return None
-    evidence = vars(geometry.evidence)
-    if not math.isfinite(geometry.evidence.log10_nfa):  # JSON has no infinity
-        evidence = evidence | {"log10_nfa": None}
+    nfa = geometry.evidence.log10_nfa  # JSON has no infinity
+    evidence = vars(geometry.evidence) | {"log10_nfa": nfa if math.isfinite(nfa) else None}
     matrix = None if geometry.matrix is None else geometry.matrix.tolist()
     return vars(geometry) | {"matrix": matrix, "evidence": evidence}
 
@@ -309,7 +300,7 @@ def register(
     chosen, selection = chosen_detector(detector, values)
     values |= {"selection": selection, "apply_to": [*own]}
     with cli.writing(files, [image0, *own], overwrite) as made:
-        with stage_progress("registering", _guided_stages(detector)) as done:
+        with stage_progress("registering", GUIDED_STAGES[detector == "points" :]) as done:
             found = register_images(image0, image1, chosen, progress=done, **values)
         moved = reference.moved(translation_matrix(*-np.array(found.origin)))
         for (path, each), bands in zip(own.items(), found.applied, strict=True):

@@ -189,14 +189,12 @@ def _check_decoded(path: Path) -> None:
     the memory before. If the frames of a video are equal, so are some of its packets, or packets
     only say that nothing changes.
     """
-    raw = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-    packets, frames = (
-        [
-            (hash(one.tobytes()), one.size)
-            for one in (capture.retrieve()[1] for _ in range(FIRST_FRAMES) if capture.grab())
-        ]
-        for capture in (raw, cv2.VideoCapture(str(path)))
-    )
+
+    def first(video: Any) -> list[tuple[int, int]]:
+        found = (video.retrieve()[1] for _ in range(FIRST_FRAMES) if video.grab())
+        return [(hash(each.tobytes()), each.size) for each in found]
+
+    packets, frames = first(_undecoded(path)), first(cv2.VideoCapture(str(path)))
     if len({*frames}) > 1:
         return
     text = f"the first {len(frames)} frames of {path} are equal"
@@ -220,16 +218,11 @@ def _camera_number(source: str | Path | int) -> int | None:
     return int(match[2]) if match and (match[1] or not Path(text).exists()) else None
 
 
-def count_frames(path: Path) -> int:
-    """Return how many frames of a video file can be read, one after the other, from its start."""
-    backend, settings = cv2.CAP_ANY, []
-    if cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends():
-        # FFmpeg can leave frames undecoded, which needs only a fiftieth of the time.
-        backend, settings = cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1]
-    capture = cv2.VideoCapture(str(path), backend, settings)
-    frames = next(number for number in count() if not capture.grab())
-    capture.release()
-    return frames
+def _undecoded(path: Path) -> Any:
+    """Open a video for its packets, which FFmpeg reads in a fiftieth of the time of frames."""
+    if cv2.CAP_FFMPEG not in cv2.videoio_registry.getBackends():
+        return cv2.VideoCapture(str(path))
+    return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
 
 
 def check_video_name(path: str | Path) -> str:
@@ -275,7 +268,10 @@ def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray],
             writer.release()
         if not sizes:
             raise DeepDetectError(f"there are no frames to write to {path}: check the source")
-        if (found := count_frames(temporary)) < len(sizes):
+        written = _undecoded(temporary)
+        found = next(number for number in count() if not written.grab())
+        written.release()
+        if found < len(sizes):
             raise DeepDetectError(
                 f"cannot write {path} ({found} of {len(sizes)} frames are in the file): free "
                 "some space, or choose another place"

@@ -219,11 +219,10 @@ def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) ->
 def compare_held_out(
     grays: Pair, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Compare each window of the first image with its predicted place in the second image.
+    """Compare windows of the first image with the places that the (M, 2) matches around predict.
 
-    The matches around a window, not those in it, predict its place. Takes (M, 2) positions of
-    matches. Returns the median correlation of the windows, 0 if too few can be compared, and (M,)
-    bool, false for matches whose window is no more similar than unrelated windows.
+    Returns the median correlation of the windows, 0 if too few can be compared, and (M,) bool,
+    false for matches whose window is no more similar than unrelated windows.
     """
     (first, scale0), (second, scale1) = (downscale(gray, HELD_OUT_SIDE_PX) for gray in grays)
     points0, points1 = scaled_points(points0, scale0), scaled_points(points1, scale1)
