@@ -69,7 +69,7 @@ CASES = {
     "a folder to view": "view {bad}/empty",
     "an archive": "detect {bad}/archive.zip",
     "a list of images": "stitch {bad}/matrix.txt {bad}/good.png -o {bad}/p.png",
-    "a pattern": "detect {bad}/*.jpg",
+    "a pattern": "detect {bad}/*.gif",
     "images to match": "match-many {bad}/good.png --pairs exhaustive",
     "two folders": "extract {bad} {bad}",
     "two videos": "track {bad}/video.mp4 {bad}/video.mp4",

@@ -32,7 +32,8 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     from skimage import data
 
     detector = DeepDetect(**values)
-    numbers = run_demo(*data.stereo_motorcycle(), detector, cli.output_folder(output))
+    left, right, disparity = data.stereo_motorcycle()
+    numbers = run_demo(left, right, disparity, detector, cli.output_folder(output))
     values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
     found, random = numbers["all_matches"], numbers["random"]
     sentence = f"{found['matches']:,} matches, {found['precision']:.0%} of them within "

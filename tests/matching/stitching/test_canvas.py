@@ -57,7 +57,7 @@ def test_what_reaches_the_horizon_is_refused(factor: int) -> None:
     # The corner of a camera with a field of view of 53 degrees.
     assert planned({0: np.eye(3), 1: factor * turned(40)}).size[0] > 1000
     for degrees in (60, 64, 90, 170):  # at 63 the corner is on the horizon; at 170 all is behind
-        with pytest.raises(DeepDetectError, match="^1 is"):
+        with pytest.raises(DeepDetectError, match=r"^1 is"):
             planned({0: np.eye(3), 1: factor * turned(degrees)})
 
 
