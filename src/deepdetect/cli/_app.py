@@ -224,6 +224,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _usage(error: CycloptsError) -> str:
     """Return a sentence on a command line that does not fit the command."""
+    if not isinstance(error, MissingArgumentError | UnusedCliTokensError):
+        return " ".join(str(error).split())
     chain = error.command_chain or ()
     *_, app = make_app().parse_commands([*chain])[1]
     helps = {
