@@ -32,6 +32,7 @@ def bad(tmp_path: Path, photos: Path) -> Path:
     for name in "ab":
         Image.new("RGB", (64, 32)).save(folder / f"sphere-{name}.jpg", xmp=sphere)
     (folder / "matrix.txt").write_text("1 2\n3 4\n")
+    (folder / "archive.zip").write_bytes(b"PK\3\4" + bytes(300))
     (folder / "video.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
     return folder
 
@@ -63,6 +64,13 @@ CASES = {
     "evaluate nothing": "dev evaluate {bad}/empty",
     "three images to register": "register {bad}/good.png {bad}/good.png {bad}/good.png",
     "three images for a pose": "pose {bad}/good.png {bad}/good.png {bad}/good.png",
+    "one image to register": "register {bad}/good.png",
+    "a folder to register": "register {bad}/empty {bad}/good.png",
+    "a folder to view": "view {bad}/empty",
+    "an archive": "detect {bad}/archive.zip",
+    "a list of images": "stitch {bad}/matrix.txt {bad}/good.png -o {bad}/p.png",
+    "a pattern": "detect {bad}/*.gif",
+    "images to match": "match-many {bad}/good.png --pairs exhaustive",
     "two folders": "extract {bad} {bad}",
     "two videos": "track {bad}/video.mp4 {bad}/video.mp4",
     "an argument for no command": "doctor {bad}",
@@ -75,7 +83,7 @@ CASES = {
             *("detect VIDEO", "match VIDEO", "match IMAGE VIDEO", "register IMAGE VIDEO"),
             *("stitch VIDEO", "pose VIDEO IMAGE", "reconstruct VIDEO", "reconstruct IMAGE VIDEO"),
             *("reconstruct IMAGE IMAGE VIDEO", "extract VIDEO"),
-            "detect IMAGE --ignore VIDEO",
+            *("detect IMAGE --ignore VIDEO", "export colmap VIDEO", "view VIDEO"),
         )
     },
     "long name of a folder": "detect {bad}/good.png -o {bad}/{long}",

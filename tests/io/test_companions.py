@@ -9,14 +9,16 @@ from PIL import Image
 from deepdetect import ImageError
 from deepdetect.io.image import find_images, name_images
 
+GREYS = np.arange(600, dtype=np.uint8).reshape(20, 30)
 
-def write(folder: Path, names: str) -> list[Path]:
+
+def write(folder: Path, names: str, pixels: np.ndarray = GREYS) -> list[Path]:
     """Write an image with each of the names, of the format that its suffix tells."""
     paths = [folder / name for name in names.split()]
     for path in paths:
         path.parent.mkdir(parents=True, exist_ok=True)
         kind = {".png": "PNG", ".tif": "TIFF", ".svs": "TIFF"}.get(path.suffix.lower(), "JPEG")
-        Image.fromarray(np.eye(20, 30, dtype=np.uint8)).save(path, kind)
+        Image.fromarray(pixels).save(path, kind)
     return paths
 
 
@@ -37,6 +39,16 @@ def test_masks_are_no_photographs(photographs: str, masks: str, tmp_path: Path) 
         assert {*find_images(tmp_path)} == {*kept}
     with pytest.warns(UserWarning, match=left_out[0].name):
         assert [*name_images([*left_out, *kept]).values()] == kept
+
+
+def test_what_is_named_as_a_mask_and_has_two_grey_levels_is_a_mask(tmp_path: Path) -> None:
+    kept = write(tmp_path, "images/000.jpg images/left_image.png mask-shop.png masks.jpg")
+    binary = np.eye(20, 30, dtype=np.uint8)
+    masks = "images/mask.png images/dynamic_mask_000.png images/left_mask.png masks/0.png"
+    left_out = write(tmp_path, masks, binary)
+    with pytest.warns(UserWarning, match="4 masks"):
+        assert {*find_images(tmp_path)} == {*kept}
+    assert name_images(left_out[-1:])
 
 
 @pytest.mark.parametrize(

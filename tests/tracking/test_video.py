@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import signal
+import zipfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -122,6 +123,17 @@ def test_a_video_in_which_nothing_moves_is_read_and_told(moving_photo, tmp_path:
         assert len(list(source)) == 6
 
 
+def test_packets_that_change_nothing_may_differ(moving_photo, tmp_path: Path) -> None:
+    shape = moving_photo(0).shape[1::-1]
+    path, code = tmp_path / "still.mp4", cv2.VideoWriter_fourcc(*"mp4v")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, 25, shape)
+    for _ in range(8):
+        writer.write(np.full((*shape[::-1], 3), 200, np.uint8))
+    writer.release()
+    with FrameSource(path) as source, pytest.warns(UserWarning, match="moves"):
+        assert len(list(source)) == 8
+
+
 class Camera:
     """What OpenCV gives for a camera, of three frames."""
 
@@ -179,11 +191,17 @@ def test_a_folder_named_like_a_camera_is_a_folder(frame_folder, tmp_path, monkey
         ("text.mp4", DeepDetectError),
         ("empty", ImageError),
         ("one.png", ImageError),
+        ("frames.zip", ImageError),
+        ("alone", ImageError),
     ],
 )
 def test_a_mistake_is_named(name: str, kind: type[Exception], moving_photo, tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("I am no video")
     (tmp_path / "empty").mkdir()
+    (tmp_path / "alone").mkdir()
+    Image.fromarray(moving_photo(0)).save(tmp_path / "alone" / "1.jpg")
+    with zipfile.ZipFile(tmp_path / "frames.zip", "w") as archive:  # OpenCV opens it
+        archive.write(tmp_path / "alone" / "1.jpg")
     Image.fromarray(moving_photo(0)).save(tmp_path / "one.png")
     with pytest.raises(kind, match=name):
         FrameSource(tmp_path / name)

@@ -13,6 +13,7 @@ import re
 import sys
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -118,7 +119,7 @@ def map_in_processes(
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     remaining = iter(tasks)
 
-    pending: deque[Future[Outcome]] = deque()
+    pending: deque[Future[tuple[Outcome, list[str]]]] = deque()
 
     def submit(most: int) -> None:
         # The processes start at the first submissions, with Ctrl-C deferred and one thread.
@@ -129,7 +130,7 @@ def map_in_processes(
     try:
         submit(TASKS_PER_WORKER * count)
         while pending:
-            yield pending.popleft().result()
+            yield told(pending.popleft().result())
             submit(1)
     except BrokenProcessPool:
         raise DeepDetectError(
@@ -166,10 +167,25 @@ def _one_thread_inherited() -> Iterator[None]:
             del os.environ[name]
 
 
-def _run_task(function: Callable[[Task], Outcome], task: Task) -> Outcome:
+def recorded(function: Callable[[Task], Outcome], task: Task) -> tuple[Outcome, list[str]]:
+    """Return the outcome of a task, and the warnings for users that `told` repeats elsewhere."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        outcome = function(task)
+    return outcome, [str(each.message) for each in caught if each.category is UserWarning]
+
+
+def told(done: tuple[Outcome, list[str]]) -> Outcome:
+    """Return an outcome of `recorded`, and repeat its warnings."""
+    for text in done[1]:
+        warnings.warn(text, UserWarning, stacklevel=3)
+    return done[0]
+
+
+def _run_task(function: Callable[[Task], Outcome], task: Task) -> tuple[Outcome, list[str]]:
     try:
         end_worker_by_signals()
-        return function(task)
+        return recorded(function, task)
     except SystemExit:  # otherwise the process would run the next task
         os._exit(1)
 

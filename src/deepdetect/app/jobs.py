@@ -196,9 +196,9 @@ def run_task(sender: Connection, order: Order) -> None:
 
 def _for_the_page(message: str, order: Order) -> str:
     """Replace paths in a message by the user's file names, and options by command-line flags."""
-    for number, image in enumerate(order.images):
+    for image in order.images:
         message = message.replace(str(image.path), image.name)
-        message = message.replace(f"images[{number}]", image.name)
     for path in (order.folder / "results", order.folder):
         message = message.replace(f"{path}{os.sep}", "")
+    message = message.replace(" (or set `force`)", "")  # the page has no such option
     return message.replace("`max_megapixels`", "--max-megapixels")

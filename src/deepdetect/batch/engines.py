@@ -24,6 +24,8 @@ from .._shared.machine import (
     disable_malloc_trim,
     map_in_processes,
     processor_count,
+    recorded,
+    told,
     use_one_thread,
 )
 
@@ -80,7 +82,7 @@ def map_on_ray(
                 outcome = pickle.loads(row["outcome"])
                 if isinstance(outcome, DeepDetectError):
                     raise outcome
-                yield outcome
+                yield told(outcome)
         except (ray.exceptions.RayActorError, ray.exceptions.RaySystemError) as error:
             raise DeepDetectError(
                 f"the Ray cluster failed ({first_line(error)}): check it, then run this again"
@@ -97,7 +99,7 @@ class _Worker:
 
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         try:
-            outcome = self.function(pickle.loads(row["task"]))
+            outcome: Any = recorded(self.function, pickle.loads(row["task"]))
         except DeepDetectError as error:  # if raised, Ray would add a traceback
             outcome = error
         return {"outcome": pickle.dumps(outcome)}

@@ -122,8 +122,9 @@ def open_hdf5(path: Path) -> Iterator[Any]:
         # A complete file is never written to, so it needs no lock; network folders may lack locks.
         file = h5py.File(path, "r", locking=False)
     except OSError as error:
-        raise DeepDetectError(
-            f"{path} is not an HDF5 file, or is damaged ({first_line(error)}): write it again"
+        raise InvalidFileError(
+            f"{path} is not an HDF5 file, or is damaged ({first_line(error)}): give one that "
+            "`deepdetect extract` or `match-many` wrote"
         ) from error
     with file:
         try:

@@ -5,15 +5,22 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.metadata
-import inspect
 import os
 import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from glob import glob
 from typing import Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
+from cyclopts import (
+    App,
+    CycloptsError,
+    Group,
+    MissingArgumentError,
+    Parameter,
+    UnusedCliTokensError,
+)
 from cyclopts.help import DefaultFormatter
 
 from .. import __version__
@@ -193,14 +200,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = show
             return _call(words)
-    except UnusedCliTokensError as error:
-        parameters = inspect.signature(error.target or main).parameters.values()
-        names = " and ".join(p.name.upper() for p in parameters if p.kind is p.POSITIONAL_ONLY)
-        text = f"`{' '.join(error.command_chain or ())}` takes only {names or 'options'}: leave out"
-        more = ", and run the command once for each" if names else ""
-        return _failed(f"{text} {' '.join(error.unused_tokens or ())}{more}", 2)
     except CycloptsError as error:
-        return _failed(" ".join(str(error).split()), 2)
+        return _failed(_usage(error), 2)
     except BatchError as error:
         lines = [f"{error.summary}:", *(f"  {with_flags(each, words)}" for each in error.failures)]
         return _failed("\n".join(lines), 1)
@@ -221,13 +222,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(text, 2)
 
 
+def _usage(error: CycloptsError) -> str:
+    """Return a sentence on a command line that does not fit the command."""
+    if not isinstance(error, MissingArgumentError | UnusedCliTokensError):
+        return " ".join(str(error).split())
+    chain = error.command_chain or ()
+    *_, app = make_app().parse_commands([*chain])[1]
+    helps = {
+        each.name: f"{each.name} ({(each.parameter.help or '').split('. ')[0].rstrip('.')})"
+        for each in app.assemble_argument_collection(parse_docstring=True)
+        if each.field_info.is_positional
+    }
+    command = f"`deepdetect {' '.join(chain)}`"
+    if isinstance(error, MissingArgumentError) and error.argument and error.argument.name in helps:
+        return f"{command} needs {helps[error.argument.name]}: its --help shows examples"
+    if isinstance(error, UnusedCliTokensError):
+        unused = " ".join(error.unused_tokens or ())
+        return (
+            f"{command} takes only {' and '.join(helps.values()) or 'options'}: leave out {unused}"
+        )
+    return " ".join(str(error).split())
+
+
 def _call(words: Sequence[str]) -> int:
     module = _module_of(words)
     if module is not None:
         importlib.import_module(module)  # cyclopts' own import would hide errors
     FORMATTER.shows_all = "--help-all" in words
-    meant = {"--help-all": "--help", "-": "/dev/stdin"}
-    words = [meant.get(word, word) for word in words]
+    meant = {"--help-all": ["--help"], "-": ["/dev/stdin"]}
+    # The shell of Windows passes patterns on, and so does every shell if they are in quotes.
+    words = [
+        each
+        for word in words
+        for each in meant.get(word) or (re.search("[*?]", word) and sorted(glob(word))) or [word]
+    ]
     app = make_app(summaries=module is None)
     command, bound, _ = app.parse_args(words, print_error=False, exit_on_error=False)
     code = command(*bound.args, **bound.kwargs) or 0

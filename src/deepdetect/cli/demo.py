@@ -32,9 +32,8 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     from skimage import data
 
     detector = DeepDetect(**values)
-    folder = cli.output_folder(output)
     left, right, disparity = data.stereo_motorcycle()
-    numbers = run_demo(left, right, disparity, detector, folder)
+    numbers = run_demo(left, right, disparity, detector, cli.output_folder(output))
     values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
     found, random = numbers["all_matches"], numbers["random"]
     sentence = f"{found['matches']:,} matches, {found['precision']:.0%} of them within "
@@ -42,12 +41,11 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     return cli.Result(values, cli.headed(sentence, values, "keypoints seconds pictures"))
 
 
-def random_pixels(image: np.ndarray, count: int, generator: np.random.Generator) -> Keypoints:
-    """Choose `count` pixels of an image at random, as keypoints for comparison."""
+def _random_pixels(image: np.ndarray, count: int, generator: np.random.Generator) -> Keypoints:
     height, width = image.shape[:2]
     drawn = generator.choice(height * width, min(count, height * width), replace=False)
     xy = np.column_stack([drawn % width, drawn // width])
-    return Keypoints(xy, np.ones(len(xy)), (width, height))
+    return describe_keypoints(luma(image), Keypoints(xy, np.ones(len(xy)), (width, height)))
 
 
 def run_demo(
@@ -59,20 +57,13 @@ def run_demo(
 ) -> dict[str, Any]:
     """Match a stereo pair, and random pixels for comparison; write pictures, return the scores.
 
-    Args:
-        left, right: (H, W, 3) uint8 RGB, rectified.
-        disparity: (H, W) ground truth of the left view in pixels; not finite where unknown.
-        detector: the network.
-        folder: folder of the visualisations.
+    `disparity` is the (H, W) ground truth of the left view in pixels; not finite where unknown.
     """
     matches = match_images(left, right, detector)
     both = matches.keypoints0, matches.keypoints1
     count = max(sum(len(each) for each in both) // 2, 1)
     generator = np.random.default_rng(0)
-    features = [
-        describe_keypoints(luma(image), random_pixels(image, count, generator))
-        for image in (left, right)
-    ]
+    features = [_random_pixels(image, count, generator) for image in (left, right)]
     random = match_features(*features, mutual=False)
     disparity = np.where(np.isfinite(disparity), disparity, np.nan).squeeze()
     errors = disparity_errors(matches.points0, matches.points1, disparity)
@@ -93,13 +84,13 @@ def run_demo(
         "left_heatmap": add_caption(heatmap, "probability of a keypoint: dark blue 0, yellow 1"),
         "matches": add_caption(lines, caption),
     }
-    paths = [folder / f"motorcycle_{name}.jpg" for name in pictures]
-    for path, picture in zip(paths, pictures.values(), strict=True):
+    paths = {folder / f"motorcycle_{name}.jpg": picture for name, picture in pictures.items()}
+    for path, picture in paths.items():
         save_picture(picture, path)
     return {
         "keypoints": [len(each) for each in both],
         "density": [each.density for each in both],
         **scores,
         "seconds": matches.seconds,
-        "pictures": paths,
+        "pictures": [*paths],
     }

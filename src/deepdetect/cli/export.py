@@ -168,6 +168,8 @@ def _export(
     inputs = [*sources, *(path for path in named if path.exists())]
     cli.check_outputs([marker], inputs)
     of_folder = len(sources) == 1 and sources[0].is_dir()
+    if sources[0].is_file() and sources[0].suffix.lower() not in (".npz", ".h5", ".hdf5"):
+        find_images(sources[0])  # fails, with advice
     saved, points = SAVED.take(values), MAX_KEYPOINTS.take(values)
     for name in saved if of_folder else (*points, *values):
         what = "saved files" if of_folder else "a folder of images"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -14,7 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from .._shared.errors import ImageError, OptionError, RegistrationError, noted_failures
+from .._shared.errors import ImageError, OptionError, noted_failures
 from .._shared.image_array import array_to_rgb
 from .._shared.progress import StageTimer, progress, stage_progress
 from ..batch.pair_list import list_pairs
@@ -43,7 +42,6 @@ from ._detection import (
     POINTS,
     SELECTION,
     Detector,
-    Kind,
     chosen_detector,
 )
 
@@ -53,10 +51,7 @@ UNGUIDED = cli.From(
 )
 UNGUIDED_STAGES = ("keypoints", "matching", "geometry")
 
-GEOMETRY = cli.From(
-    GeometryOptions,
-    more="inlier_threshold confidence iterations",
-)
+GEOMETRY = cli.From(GeometryOptions, more="inlier_threshold confidence iterations")
 REGISTRATION = cli.From(register_images, "extent", more="mutual seed")
 PANORAMA = cli.From(stitch_images, "projection crop force", more="seed")
 OPTIONS = cli.From(StitchingOptions)
@@ -122,7 +117,7 @@ def match(
     match_pair: Callable[..., Matches] = match_images
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
-    stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
+    stages = UNGUIDED_STAGES if unguided else GUIDED_STAGES[detector == "points" :]
     of_pinholes = partial(_load_of_pinhole, rim=unguided)
     flat = values.get("model") == "homography"
     load = lru_cache(2)(load_pixels if flat else of_pinholes)  # successive pairs share an image
@@ -270,16 +265,11 @@ def _numbers(
     }
 
 
-def _guided_stages(detector: Kind) -> tuple[str, ...]:
-    return GUIDED_STAGES[1:] if detector == "points" else GUIDED_STAGES
-
-
 def _geometry_values(geometry: TwoViewGeometry | None) -> dict[str, Any] | None:
     if geometry is None:
         return None
-    evidence = vars(geometry.evidence)
-    if not math.isfinite(geometry.evidence.log10_nfa):  # JSON has no infinity
-        evidence = evidence | {"log10_nfa": None}
+    nfa = geometry.evidence.log10_nfa  # JSON has no infinity
+    evidence = vars(geometry.evidence) | {"log10_nfa": nfa if math.isfinite(nfa) else None}
     matrix = None if geometry.matrix is None else geometry.matrix.tolist()
     return vars(geometry) | {"matrix": matrix, "evidence": evidence}
 
@@ -322,7 +312,7 @@ def register(
     chosen, selection = chosen_detector(detector, values)
     values |= {"selection": selection, "apply_to": [*own]}
     with cli.writing(files, [image0, *own], overwrite) as made:
-        with stage_progress("registering", _guided_stages(detector)) as done:
+        with stage_progress("registering", GUIDED_STAGES[detector == "points" :]) as done:
             found = register_images(image0, image1, chosen, progress=done, **values)
         moved = reference.moved(translation_matrix(*-np.array(found.origin)))
         for (path, each), bands in zip(own.items(), found.applied, strict=True):
@@ -404,23 +394,15 @@ def stitch(
     cli.check_outputs([file], paths)
 
     with cli.writing({"file": file}, images, overwrite) as made:
-        try:
-            with (
-                stage_progress("stitching", stages_of(len(images))) as done,
-                warnings.catch_warnings(record=True, action="always") as caught,
-            ):
-                panorama = stitch_images(
-                    images,
-                    detector=chosen,
-                    reference=None if reference is None else images.index(reference),
-                    options=options,
-                    progress=done,
-                    **values,
-                )
-        except (OptionError, RegistrationError) as error:
-            raise type(error)(_named(error, images)) from error
-        for warning in caught:
-            warnings.warn(_named(warning.message, images), warning.category, stacklevel=2)
+        with stage_progress("stitching", stages_of(len(images))) as done:
+            panorama = stitch_images(
+                images,
+                detector=chosen,
+                reference=None if reference is None else images.index(reference),
+                options=options,
+                progress=done,
+                **values,
+            )
         moved = panorama.homographies[panorama.reference] if flat else None
         kept, image = carried[panorama.reference].moved(moved), panorama.image
         if file.suffix.lower() in (".tif", ".tiff"):

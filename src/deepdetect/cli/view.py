@@ -37,7 +37,8 @@ def view(
         deepdetect view left_right_matches.npz left.png right.png
     """
     if not file.is_file():
-        raise MissingFileError(f"there is no file {file}: give one that another command wrote")
+        what = "a folder" if file.is_dir() else "no file"
+        raise MissingFileError(f"{file} is {what}: give a file that another command wrote")
     numbers: dict[str, object] = {}
     if len(images) > 2:
         raise OptionError("give one image for keypoints, or two for matches")
@@ -52,8 +53,8 @@ def view(
         found = [path for path in beside if path.suffix.lower() in SHOWN and path.is_file()]
         if not found:
             raise OptionError(
-                f"a browser cannot display {file}: unknown type; for keypoints and matches give "
-                "their images, as in deepdetect view FILE IMAGE ..."
+                f"a browser cannot display {file}: open a video with a player, and give the images "
+                "of keypoints or matches, as in deepdetect view FILE IMAGE ..."
             )
         shown = found[0]
     if not webbrowser.open(shown.absolute().as_uri()):

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from .image_file import FORMATS, identify
+from .image_file import FORMATS, identify, open_image
 
 MASK_WORD = re.compile(r"^masks?([ ._-]+|$)|[ ._-]+masks?(?=[ ._-]|$)", re.IGNORECASE)
 """This word is what distinguishes the name of a mask, or of a folder of masks."""
@@ -22,10 +22,11 @@ def holds_image(path: Path) -> bool:
 
 
 def without_masks(paths: Iterable[Path]) -> list[Path]:
-    """Return the image files without those that are named as masks of others; warn about these.
+    """Return the image files without those that are masks of others; warn about these.
 
     Masks of NAME.jpg are NAME_mask.png, NAME.mask.png, mask_NAME.png and NAME.jpg.png in its
-    folder, and these and NAME.png below a folder `masks`.
+    folder, and these and NAME.png below a folder `masks`. With any other NAME, an image that is
+    named so is a mask if it has at most two grey levels.
     """
     paths = [*paths]
     folders = {path.parent for path in paths}
@@ -37,13 +38,23 @@ def without_masks(paths: Iterable[Path]) -> list[Path]:
 
     def is_mask(path: Path) -> bool:
         name = MASK_WORD.sub("", path.stem).casefold()
-        own, changed = (path.parent, name), name != path.stem.casefold()
-        beside = own in names or (changed and own in stems)
-        return beside or (path.parent in marked and name in photographs)
+        own, called = (path.parent, name), name != path.stem.casefold()
+        if own in names or (called and own in stems):
+            return True
+        inside = path.parent in marked
+        return (inside and name in photographs) or ((inside or called) and _has_two_levels(path))
 
     masks = dict.fromkeys(filter(is_mask, paths))
-    tell_left_out([*masks], "files named as masks of other images")
+    if len(masks) == len(paths):
+        return paths
+    tell_left_out([*masks], "masks of other images")
     return [path for path in paths if path not in masks]
+
+
+def _has_two_levels(path: Path) -> bool:
+    with suppress(Exception), open_image(path) as image:
+        return image.convert("L").getcolors(2) is not None
+    return False
 
 
 def tell_left_out(paths: Sequence[Path], what: str) -> None:

@@ -74,9 +74,9 @@ IMAGE_SUFFIXES = (*" ".join([*FORMATS.values(), *_OTHERS]).split(), *RAW_SUFFIXE
 MAX_MEGAPIXELS = 200.0
 """Images with more megapixels are rejected by default. The largest phone sensors have 200."""
 
-SIGNATURE_BYTES = 200
-"""Formats are recognised by this many first bytes: those of DICOM are bytes 128 to 131, and those
-of an MPEG transport stream in its first two packets."""
+SIGNATURE_BYTES = 262
+"""Formats are recognised by this many first bytes: those of DICOM are bytes 128 to 131, those of an
+MPEG transport stream in its first two packets, and those of tar from byte 257 on."""
 
 STANDARD_INPUT = "/dev/stdin"
 """This path means standard input on every system. For commands, "-" does so as well."""
@@ -96,6 +96,16 @@ VIDEO = (
 )
 """First bytes of Matroska, AVI, WMV, FLV, Ogg, MPEG-1 and 2, H.264 and H.265, MXF, DV, IVF,
 YUV4MPEG, MP4 and MOV, and of MPEG transport streams, whose packets have 188 or 192 bytes."""
+
+OTHERS = {
+    rb"(?s)PK\x03\x04|7z\xbc\xaf|Rar!|\x1f\x8b|BZh|\xfd7zXZ|.{257}ustar": (
+        "an archive: unpack it, and give the folder"
+    ),
+    rb"%PDF": 'a PDF file: draw its pages, as pdftoppm -r 200 -png "{0}" page does, and give these',
+    rb"(?!#EXTM3U)[^\0-\x08\x0e-\x1a\x1c-\x1f]{4,}\Z": "text: give image files, or their folder",
+}
+"""First bytes of files that people give for images or videos, what these are, and what to do. A
+playlist of a video is text that OpenCV reads."""
 
 
 @suggest_keywords
@@ -282,7 +292,9 @@ def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
     elif is_path(source):
         mode = os.stat(source).st_mode
         pipe = stat.S_ISFIFO(mode) and name.startswith("/dev/fd/")  # from a shell's <(...)
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or pipe):
+        if stat.S_ISDIR(mode):
+            raise ImageError(f"{name} is a folder: give an image file in it")
+        if not (stat.S_ISREG(mode) or pipe):
             raise ImageError(f"{name} is a pipe or a device: save the image as a file first")
         # Given a path, Pillow maps uncompressed TIFF into memory and turns it the wrong way.
         with open(os.fspath(source), "rb") as file:
@@ -366,7 +378,15 @@ def identify(file: BinaryIO, name: str, formats: Iterable[str] = FORMATS) -> Any
             f'{name} is a video: take frames from it, such as by ffmpeg -i "{name}" -vf fps=5 '
             "frames/%05d.jpg (docs/reconstruction.md), and give these"
         )
+    refuse_others(start, name)
     raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG")
+
+
+def refuse_others(start: bytes, name: str) -> None:
+    """Raise an ImageError if the first bytes of a file show neither an image nor a video."""
+    for begins, what in OTHERS.items():
+        if re.match(begins, start) and not re.match(VIDEO, start):
+            raise ImageError(f"{name} is {what.format(name)}")
 
 
 def develop(file: BinaryIO, name: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -24,7 +25,7 @@ from .._shared.errors import (
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..io.image import find_images, load_image, load_pixels, one_range
-from ..io.image_file import IMAGE_SUFFIXES, read_with
+from ..io.image_file import IMAGE_SUFFIXES, SIGNATURE_BYTES, read_with, refuse_others
 from ..io.tiff import page_numbers
 
 FOLDER_FPS = 10.0
@@ -36,6 +37,8 @@ MAX_FPS = 1000.0
 FIRST_FRAMES = 25
 """This many frames are compared: if all are equal, so are some of their packets, since counters in
 the headers of H.264 start again after 16 frames, and MPEG's groups of pictures after 12 to 15."""
+
+SINGLE = "has a single frame: give a video, or a folder of frames"
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 
@@ -94,27 +97,30 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             self._images = [(each, None) for each in find_images(path)]
         elif not self.live and path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
             self._images = [(path, page) for page in page_numbers(path)]
-            if len(self._images) == 1:
-                raise ImageError(f"{path} is a single image: give a video, or a folder of frames")
         else:
-            self._capture = self._opened(path)
+            self._capture = self._opened(str(source))
             stated = float(self._capture.get(cv2.CAP_PROP_FPS))
             fps = stated if 0 < stated <= MAX_FPS else fps
             total = 0 if self.live else int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if len(self._images) == 1:
+            raise ImageError(f"{path} {SINGLE}")
         self.fps = fps / every
         taken = -(-max(0, len(self._images) or total) // every)
         self.count = min((number for number in (taken, max_frames) if number), default=None)
 
-    def _opened(self, path: Path) -> Any:
-        if not self.live and not path.is_file():
+    def _opened(self, path: str) -> Any:
+        if not self.live and not self.path.is_file():
             raise MissingFileError(f"there is no video, folder or camera {path}: check the path")
-        capture = cv2.VideoCapture(self.camera if self.live else str(path))
-        if capture.isOpened():
-            return capture
-        if self.live:
+        capture = cv2.VideoCapture(self.camera if self.live else path)
+        if self.live and not capture.isOpened():
             raise MissingFileError(
                 f"there is no camera {self.camera}, or another program uses it: try another number"
             )
+        if not self.live:  # OpenCV also opens archives of JPEG files
+            with self.path.open("rb") as file:
+                refuse_others(file.read(SIGNATURE_BYTES), path)
+        if capture.isOpened():
+            return capture
         raise InvalidFileError(
             f"the installed OpenCV cannot read {path} as a video: convert it to MP4 (H.264), or "
             "give a folder of its frames"
@@ -162,8 +168,10 @@ class FrameSource(AbstractContextManager["FrameSource"]):
                 if number == self.every and not self.live and np.array_equal(rgb, first):
                     _check_decoded(self.path)
                 yield Frame(number, rgb)
-        if not number:
+        if number == 0:
             raise DeepDetectError("the source has no frames: check it with another program")
+        if number == 1:
+            raise DeepDetectError(f"{self.path} {SINGLE}")
 
     def __exit__(self, *_: object) -> None:
         if self._capture is not None:
@@ -174,17 +182,22 @@ def _check_decoded(path: Path) -> None:
     """Warn if the first frames of a video are all equal; raise an error if they should not be.
 
     The conversion of interlaced frames fails in OpenCV 4.14 and 5.0, which then return what was in
-    the memory before. If the frames of a video are equal, so are some of its packets.
+    the memory before. If the frames of a video are equal, so are some of its packets, or packets
+    only say that nothing changes.
     """
-    raw = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-    packets, frames = (
-        [hash(capture.retrieve()[1].tobytes()) for _ in range(FIRST_FRAMES) if capture.grab()]
-        for capture in (raw, cv2.VideoCapture(str(path)))
-    )
+
+    def first(video: Any) -> list[tuple[int, int]]:
+        found = (video.retrieve()[1] for _ in range(FIRST_FRAMES) if video.grab())
+        return [(hash(each.tobytes()), each.size) for each in found]
+
+    packets, frames = first(_undecoded(path)), first(cv2.VideoCapture(str(path)))
     if len({*frames}) > 1:
         return
     text = f"the first {len(frames)} frames of {path} are equal"
-    if packets and len({*packets}) == len(packets):
+    # An encoder skips an unchanged block of 16x16 pixels by a bit; headers take up to 100 bytes.
+    unchanged = frames[0][1] / 3 / 16**2 / 8 + 100
+    differ = packets and len({*packets}) == len(packets)
+    if differ and np.median([size for _, size in packets]) > unchanged:
         raise InvalidFileError(
             f"{text}, but should not be, as where the installed OpenCV fails with interlaced "
             f'videos: convert it, such as by ffmpeg -i "{path}" -vf yadif progressive.mp4'
@@ -198,19 +211,15 @@ def _camera_number(source: str | Path | int) -> int | None:
             raise OptionError(f"the number of a camera must be 0 or more, not {source}")
         return source
     text = str(source)
-    return int(text) if text.isascii() and text.isdigit() and not Path(text).exists() else None
+    match = re.fullmatch(r"(/dev/video)?([0-9]+)", text)
+    return int(match[2]) if match and (match[1] or not Path(text).exists()) else None
 
 
-def count_frames(path: Path) -> int:
-    """Return how many frames of a video file can be read, one after the other, from its start."""
-    backend, settings = cv2.CAP_ANY, []
-    if cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends():
-        # FFmpeg can leave frames undecoded, which needs only a fiftieth of the time.
-        backend, settings = cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1]
-    capture = cv2.VideoCapture(str(path), backend, settings)
-    frames = next(number for number in count() if not capture.grab())
-    capture.release()
-    return frames
+def _undecoded(path: Path) -> Any:
+    """Open a video for its packets, which FFmpeg reads in a fiftieth of the time of frames."""
+    if cv2.CAP_FFMPEG not in cv2.videoio_registry.getBackends():
+        return cv2.VideoCapture(str(path))
+    return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
 
 
 def check_video_name(path: str | Path) -> str:
@@ -256,7 +265,10 @@ def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray],
             writer.release()
         if not sizes:
             raise DeepDetectError(f"there are no frames to write to {path}: check the source")
-        if (found := count_frames(temporary)) < len(sizes):
+        written = _undecoded(temporary)
+        found = next(number for number in count() if not written.grab())
+        written.release()
+        if found < len(sizes):
             raise DeepDetectError(
                 f"cannot write {path} ({found} of {len(sizes)} frames are in the file): free "
                 "some space, or choose another place"

@@ -78,6 +78,23 @@ def test_where_a_wall_ends_tells_nothing() -> None:
     assert is_repeated((first, second), points, shift(0))
 
 
+def test_what_is_written_in_a_table_tells_its_cells_apart() -> None:
+    """In the small copies, the numbers in the cells of a large page look alike."""
+    rng, page = np.random.default_rng(5), np.full((1120, 800), 245, np.uint8)
+    for y in range(0, 1120, 40):
+        page[y : y + 2] = 60
+        for x in range(0, 800, 100):
+            page[y : y + 40, x : x + 2] = 60
+            text = f"{rng.integers(1000, 9999)}"
+            cv2.putText(page, text, (x + 20, y + 27), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 30)
+    points = np.argwhere(page < 100)[::7, ::-1].astype(np.float64)
+    assert not is_repeated((page, page), points, np.eye(3))
+    down = np.array([[1, 0, 0], [0, 1, 40], [0, 0, 1.0]])
+    assert is_repeated((page, page), points, down)
+    page[:] = np.tile(page[40:80, 100:200], (28, 8))
+    assert is_repeated((page, page), points, np.eye(3))
+
+
 def test_a_scene_that_does_not_repeat_is_not_repeated() -> None:
     gray = texture(np.random.default_rng(1), *SIZE[::-1]).astype(np.uint8)
     assert not is_repeated((gray, gray), POINTS, np.eye(3))

@@ -22,7 +22,7 @@ def moved(x: float, y: float = 0) -> np.ndarray:
 
 
 def planned(homographies: dict[int, np.ndarray], reference: int = 0, scale: float = 1.0) -> Canvas:
-    return plan_plane(dict.fromkeys(homographies, SIZE), homographies, reference, scale)[0]
+    return plan_plane(dict.fromkeys(homographies, SIZE), homographies, reference, scale, "0123")[0]
 
 
 def put_together(images: dict[int, np.ndarray], canvas: Canvas):

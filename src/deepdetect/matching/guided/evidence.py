@@ -39,9 +39,10 @@ from ...geometry.transforms import (
 )
 from .tentative_matches import Pair
 
-COMPARED_SIDE_PX = 320
-"""Images are reduced to this longer side before shifts are compared. This is enough, because the
-periods of patterns are many pixels long."""
+COMPARED_SIDE_PX, DETAILED_SIDE_PX = 320, 1280
+"""Images are reduced to the first longer side before shifts are compared, because the periods of
+patterns are many pixels long. What differs from period to period, as the numbers of a table do, may
+show only in images of the second side."""
 
 MIN_SHIFT_PX = 10
 """Shorter shifts of the reduced images are ignored, because aligned images correlate there."""
@@ -122,38 +123,50 @@ def is_repeated(
     x, y = np.rint(scaled_points(points0, scale0)).clip(0, last).astype(np.int64).T
     places = np.zeros(first.shape, bool)
     places[y, x] = True
-    own = warped_zncc(first, second, matrix)
     for shift in _similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
         other = refine_homography(first, second, matrix @ translation_matrix(*shift))
-        others = warped_zncc(first, second, other)
-        step = np.linalg.inv(matrix) @ other
         middle = np.array([last / 2])
-        if transfer_errors(middle, middle, step)[0] < MIN_SHIFT_PX:
+        if transfer_errors(middle, middle, np.linalg.inv(matrix) @ other)[0] < MIN_SHIFT_PX:
             continue  # the refinement undid the shift
-        # Content that recurs one shift away in the first image is no evidence for the homography:
-        # where the pattern ends, its next period may just be hidden.
-        recurring = [warped_zncc(first, first, move) for move in (step, np.linalg.inv(step))]
-        recurs = np.fmax(*recurring) > MIN_ZNCC
+        compared = _compare(first, second, matrix, other)
         # Matches along one edge fit any shift along it, but the rest of the images may decide.
-        if not (
-            _preferred(own[places], others[places], recurs[places], distinct)
-            or _preferred(own.ravel(), others.ravel(), recurs.ravel(), distinct=False)
-        ):
-            copy = scaled_homography(other, 1 / scale0, 1 / scale1)
-            if sparse is None or not _parallax_decides(
-                first, scale0, sparse, homography, copy, seed
-            ):
-                return True
+        if _preferred(compared[:, places], distinct) or _preferred(compared):
+            continue
+        copy = scaled_homography(other, 1 / scale0, 1 / scale1)
+        if sparse and _parallax_decides(first, scale0, sparse, homography, copy, seed):
+            continue
+        (large0, by0), (large1, by1) = (downscale(gray, DETAILED_SIDE_PX) for gray in grays)
+        own, other = (scaled_homography(each, by0, by1) for each in (homography, copy))
+        other = refine_homography(large0, large1, other)
+        if not _preferred(_compare(large0, large1, own, other)):
+            return True
     return False
 
 
-def _preferred(own: np.ndarray, others: np.ndarray, recurs: np.ndarray, distinct: bool) -> bool:
-    """Return whether (N,) ZNCCs at places prefer a homography (`own`) to its copy (`others`)."""
-    explained = np.fmax(own, others) > MIN_ZNCC  # False where both are NaN
-    known = explained & np.isfinite(own) & np.isfinite(others)
+def _compare(
+    first: np.ndarray, second: np.ndarray, matrix: np.ndarray, other: np.ndarray
+) -> np.ndarray:
+    """Return ZNCCs by a homography, by its copy, and one period on in the first image, stacked."""
+    step = np.linalg.inv(matrix) @ other
+    recurring = (warped_zncc(first, first, move) for move in (step, np.linalg.inv(step)))
+    own, others = (warped_zncc(first, second, each) for each in (matrix, other))
+    return np.stack([own, others, np.fmax(*recurring)])
+
+
+def _preferred(compared: np.ndarray, distinct: bool = False) -> bool:
+    """Return whether (3, ...) ZNCCs of `_compare` prefer a homography to its copy.
+
+    Content that recurs one shift away in the first image is no evidence for either: where the
+    pattern ends, or something covers it, its next period may just be hidden.
+    """
+    own, others, recurring = compared
+    best = np.fmax(own, others)  # NaN where both are
+    known = (best > MIN_ZNCC) & np.isfinite(own) & np.isfinite(others)
+    recurs = (recurring > MIN_ZNCC) & (recurring > best - MIN_ZNCC_GAIN)
     gain = (own - others)[known]
-    alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
-    other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
+    alone, other_alone = (
+        np.sum((sign * gain > MIN_ZNCC_GAIN) & ~recurs[known]) for sign in (1, -1)
+    )
     if len(gain) < MIN_COMPARED:
         # With so few places, the distinctive descriptors of sparse matches suffice if enough of
         # their patches look alike and the copy alone explains no place.
@@ -206,11 +219,10 @@ def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) ->
 def compare_held_out(
     grays: Pair, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Compare each window of the first image with its predicted place in the second image.
+    """Compare windows of the first image with the places that the (M, 2) matches around predict.
 
-    The matches around a window, not those in it, predict its place. Takes (M, 2) positions of
-    matches. Returns the median correlation of the windows, 0 if too few can be compared, and (M,)
-    bool, false for matches whose window is no more similar than unrelated windows.
+    Returns the median correlation of the windows, 0 if too few can be compared, and (M,) bool,
+    false for matches whose window is no more similar than unrelated windows.
     """
     (first, scale0), (second, scale1) = (downscale(gray, HELD_OUT_SIDE_PX) for gray in grays)
     points0, points1 = scaled_points(points0, scale0), scaled_points(points1, scale1)

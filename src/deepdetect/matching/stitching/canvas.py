@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,7 +99,7 @@ def least_distorted(sizes: Sizes, homographies: Matrices) -> int:
 
 
 def plan_plane(
-    sizes: Sizes, homographies: Matrices, reference: int, scale: float
+    sizes: Sizes, homographies: Matrices, reference: int, scale: float, names: Sequence[str]
 ) -> tuple[Canvas, dict[int, np.ndarray]]:
     """Find the smallest flat canvas that holds all images, and their homographies to it.
 
@@ -111,7 +111,7 @@ def plan_plane(
         depths = _depths(sizes[number], matrix)
         if depths.min() * MAX_DEPTH_RATIO <= depths.max():
             raise RegistrationError(
-                f"images[{number}] is too oblique to images[{reference}] for a flat panorama: "
+                f"{names[number]} is too oblique to {names[reference]} for a flat panorama: "
                 "choose a `reference` between them, or, if the camera only rotated, the "
                 "projection 'cylindrical'"
             )

@@ -18,7 +18,7 @@ from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_pixels, one_range
-from ...io.image_file import read_with
+from ...io.image_file import file_name, is_path, read_with
 from ...io.projection import require_pinhole
 from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
@@ -178,6 +178,7 @@ def stitch(
             raise OptionError(
                 f"`reference` must be an image number, 0 to {len(images) - 1}, not {reference}"
             )
+    names = [file_name(one) if is_path(one) else f"images[{k}]" for k, one in enumerate(images)]
     timer = StageTimer(progress)
     with one_range(images, channels) as reading:
         pass
@@ -192,10 +193,11 @@ def stitch(
             force=force,
             seed=seed,
             progress=progress,
+            names=names,
         )
     scales = {number: scale for number, (_, scale) in small.items()}
     canvas, homographies, reference = _plan(
-        registration, scales, sizes, projection, reference, options.scale
+        registration, scales, sizes, projection, reference, options.scale, names
     )
     canvas.check_size(options.max_canvas_megapixels)
     with timer.stage("compositing"), read_with(reading):
@@ -251,6 +253,7 @@ def _plan(
     projection: Projection,
     reference: int | None,
     scale: float,
+    names: Sequence[str],
 ) -> tuple[Canvas, dict[int, np.ndarray], int]:
     """Return the canvas, the homographies of the panorama, and the index of the reference image.
 
@@ -264,7 +267,7 @@ def _plan(
         }
         if reference is None:
             reference = least_distorted(sizes, homographies)
-        return *plan_plane(sizes, homographies, reference, scale), reference
+        return *plan_plane(sizes, homographies, reference, scale, names), reference
     if reference is None:
         ahead = {number: one.rotation[:, 2] for number, one in registration.cameras.items()}
         middle = np.sum(list(ahead.values()), axis=0)

@@ -22,6 +22,7 @@ from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints, detect_sift
+from ...geometry.estimation import TwoViewModel
 from ...geometry.transforms import transfer_errors, transform_points
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 from ...io.image import luma
@@ -91,15 +92,18 @@ def register_images(
     force: bool = False,
     seed: int = 0,
     progress: Callable[[str], object] | None = None,
+    names: Sequence[str] = (),
 ) -> JointRegistration:
     """Find the homographies of overlapping uint8 images of 3 or 4 channels to a common frame.
 
     SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
     without heat map do both. The largest group of connected images is registered, or the group that
     contains image number `reference`. If `turning`, cameras that only rotate are estimated as well.
-    If `force`, images that contradict each other give a warning, not an error.
+    If `force`, images that contradict each other give a warning, not an error. `names` are those
+    of the images in both.
     """
     done = progress or (lambda _: None)
+    names = names or [f"images[{number}]" for number in range(len(images))]
     views = []
     for image in images:
         views.append(_prepare(image, detector))
@@ -108,7 +112,7 @@ def register_images(
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
         group = next(group for group in groups if reference in group)
-        nothing = f"the reference, images[{reference}], overlaps with no other image"
+        nothing = f"the reference, {names[reference]}, overlaps with no other image"
     else:
         matches = {group: sum(p.matches for p in pairs if p.first in group) for group in groups}
         group = max(groups, key=lambda group: (len(group), matches[group]))
@@ -143,7 +147,7 @@ def register_images(
     unlike = [not agree(grays[p.first], grays[p.second], p.homography) for p in pairs]
     if residual_px > MAX_RESIDUAL_PX or np.mean(unlike) > 0.5:  # a few wrong pairs are outvoted
         reason = (
-            f"images[{worst.first}] and images[{worst.second}] contradict each other where they "
+            f"{names[worst.first]} and {names[worst.second]} contradict each other where they "
             f"overlap ({off_px:.1f} px in the panorama): leave one of them out, or {hint}"
         )
         if not force:
@@ -202,9 +206,9 @@ def _registered_pairs(
         done("overlaps")
     overlaps.sort(key=lambda overlap: -len(overlap[0].points0))
     pairs: list[RegisteredPair] = []
-    partners = [0] * len(views)
+    partners = np.zeros(len(views), int)
     for geometry, tentative, first, second in overlaps:
-        enough = min(partners[first], partners[second]) >= MIN_PARTNERS
+        enough = partners[[first, second]].min() >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
         pair = _register(views, first, second, geometry, seed)
@@ -217,8 +221,7 @@ def _registered_pairs(
             pair = _register(views, first, second, geometry, seed)
         if pair is not None:
             pairs.append(pair)
-            partners[first] += 1
-            partners[second] += 1
+            partners[[first, second]] += 1
     return pairs
 
 
@@ -263,33 +266,20 @@ def _registered_again(
         if pair is None:
             near = bool(partners[first] & partners[second])
             enough = min(len(partners[first]), len(partners[second])) >= MIN_PARTNERS
-            good = (near and enough) or not any(
-                _shown(views[a], views[b], between) >= MIN_OVERLAP
-                for a, b, between in (
-                    (first, second, matrix),
-                    (second, first, np.linalg.inv(matrix)),
-                )
-            )
+            ways = (first, second, matrix), (second, first, np.linalg.inv(matrix))
+            shown = max(_shown(views[a], views[b], between) for a, b, between in ways)
+            good = (near and enough) or shown < MIN_OVERLAP
         else:
             good = _disagreement_px(pair, to_common) < MAX_DISAGREEMENT_PX
         if not good:
             nowhere = np.empty((0, 2))
-            geometry = InitialGeometry(
-                "homography",
-                matrix,
-                np.zeros(0, bool),
-                0.0,
-                points0=nowhere,
-                points1=nowhere,
-                others=(nowhere, nowhere),
-                prescribed=True,
-            )
+            fit = TwoViewModel("homography", matrix, np.zeros(0, bool), 0.0)
+            geometry = InitialGeometry.of(fit, nowhere, nowhere, "homography")
             again = _register(views, first, second, geometry, seed)
             if again is not None:
                 partners[first].add(second)
                 partners[second].add(first)
-            if again is not None and (pair is None or again.matches > pair.matches):
-                pair = again
+                pair = again if pair is None or again.matches > pair.matches else pair
         if pair is not None:
             result.append(pair)
     return result
@@ -305,13 +295,11 @@ def _shown(first: _Image, second: _Image, homography: np.ndarray) -> float:
 
 def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
     """Return the images that pairs connect with a given image, itself included."""
-    reached = {number}
-    while True:
-        touching = [pair for pair in pairs if pair.first in reached or pair.second in reached]
-        more = {end for pair in touching for end in (pair.first, pair.second)}
-        if more <= reached:
-            return reached
-        reached |= more
+    reached, before = {number}, 0
+    while len(reached) > before:
+        before, ends = len(reached), [{pair.first, pair.second} for pair in pairs]
+        reached = reached.union(*(each for each in ends if each & reached))
+    return reached
 
 
 def _compose(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
