@@ -12,9 +12,9 @@ MIN_SMOOTH_SHARE = 0.7
 """Pixels of a frame differ from its colour by at most this number of grey levels in each channel,
 about what JPEG leaves; the first share of the outermost pixels has exactly this colour. Each part
 covers the second share of the image, one row of 500. The scene covers the third share; a video in
-portrait format covers 0.32 of one in landscape format. The scene, or each part of the frame,
-reaches `MIN_SMOOTH_SHARE` of the outline of its convex hull, up to `FRAME_MARGIN_PX`: a scene may
-partly have the colour of the frame, but a skyline does not reach so much."""
+portrait format covers 0.32 of one in landscape format. The scene reaches `MIN_SMOOTH_SHARE` of the
+outline of its convex hull, up to `FRAME_MARGIN_PX`: it may partly have the colour of the frame, but
+a skyline does not reach so much."""
 
 FRAME_MARGIN_PX = 8
 """Pixels up to this far from a frame or overlay belong to it, because keypoints there would show
@@ -32,37 +32,28 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     if counts.max() < MIN_RING_SHARE * len(ring):
         return np.zeros(rgb.shape[:2], bool)
     colour = (values[counts.argmax()] >> np.array([16, 8, 0]) & 255).astype(np.float64)
+    near = (np.abs(ring - colour) <= MAX_FRAME_NOISE).all(axis=1)
+    colour = np.median(ring[near], axis=0)
     with one_opencv_thread():  # OpenCV would start more than OMP_NUM_THREADS allows
         return _frame_of_colour(rgb, colour)
 
 
 def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    nowhere = np.zeros(rgb.shape[:2], bool)
     flat = cv2.inRange(rgb, colour - MAX_FRAME_NOISE, colour + MAX_FRAME_NOISE)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     areas = stats[:, cv2.CC_STAT_AREA]
     parts = [k for k in border if k and areas[k] >= MIN_FRAME_SHARE * flat.size]
-    near = MAX_FRAME_NOISE // 4
-    close = np.bincount(
-        labels[cv2.inRange(rgb, colour - near, colour + near) > 0], minlength=len(areas)
-    )
-    # Most of a frame is much closer to its colour than JPEG may leave it, unlike textured blobs.
-    if 2 * close[parts].sum() < areas[parts].sum():
-        return nowhere
     scene = cv2.morphologyEx(
         (~np.isin(labels, parts)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))
     )
     hull, smooth = _convex_hull(scene)
     frame = ~hull
-    if not (smooth and frame.any()):
-        frame = np.isin(
-            labels, [k for k in parts if _convex_hull((labels == k).astype(np.uint8))[1]]
-        )
     sides = [frame[0].any(), frame[-1].any(), frame[:, 0].any(), frame[:, -1].any()]
     # A sky may be as uniform, but it does not reach all four sides, and is not black.
-    if sum(sides) < (4 if colour.any() else 3) or frame.mean() > 1 - MIN_SCENE_SHARE:
-        return nowhere
+    enough = sum(sides) >= (4 if colour.any() else 3)
+    if not (smooth and enough) or frame.mean() > 1 - MIN_SCENE_SHARE:
+        return np.zeros(rgb.shape[:2], bool)
     return widened(frame, FRAME_MARGIN_PX)
 
 

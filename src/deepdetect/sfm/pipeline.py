@@ -162,6 +162,7 @@ def reconstruct_many(
             matched=verified,
             pairs=len(matches),
             pair_choice=options.pair_choice(len(sizes)),
+            left_out=stages.left_out,
             seconds=timer.seconds,
             files=output_files(target, options.formats)[:-1],
         )
