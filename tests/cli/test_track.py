@@ -34,8 +34,8 @@ def test_a_folder(run, frames: Path, tmp_path: Path) -> None:
     assert max(len(frame) for frame in table) <= 80
     with FrameSource(tmp_path / "out.mp4") as video:
         assert len(list(video)) == 4
-    # The tracks of a compressed video, of every second frame, as a table alone. (The video above has
-    # a caption, of which the digits that stand still are an overlay.)
+    # The tracks of a compressed video, of every second frame, as a table alone. In the video above,
+    # the caption stands still.
     with write_video(tmp_path / "plain.mp4", 10) as write:
         for path in sorted(frames.iterdir()):
             write(np.asarray(Image.open(path)))

@@ -10,11 +10,11 @@ from .._shared.opencv import cv2
 MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
 MIN_SMOOTH_SHARE = 0.7
 """Pixels of a frame differ from its colour by at most this number of grey levels in each channel,
-about what JPEG leaves; the first share of the outermost pixels has exactly this colour. Each part
+about what JPEG leaves; the first share of the outermost pixels is exactly equal. Each part
 covers the second share of the image, one row of 500. The scene covers the third share; a video in
-portrait format covers 0.32 of one in landscape format. The scene reaches `MIN_SMOOTH_SHARE` of the
-outline of its convex hull, up to `FRAME_MARGIN_PX`: it may partly have the colour of the frame, but
-a skyline does not reach so much."""
+portrait format covers 0.32 of one in landscape format. The scene, or each part of the frame,
+reaches `MIN_SMOOTH_SHARE` of the outline of its convex hull, up to `FRAME_MARGIN_PX`: a scene may
+partly have the colour of the frame, but a skyline does not reach so much."""
 
 FRAME_MARGIN_PX = 8
 """Pixels up to this far from a frame or overlay belong to it, because keypoints there would show
@@ -39,6 +39,7 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
 
 
 def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    nowhere = np.zeros(rgb.shape[:2], bool)
     flat = cv2.inRange(rgb, colour - MAX_FRAME_NOISE, colour + MAX_FRAME_NOISE)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
@@ -49,11 +50,19 @@ def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
     )
     hull, smooth = _convex_hull(scene)
     frame = ~hull
+    if not (smooth and frame.any()):
+        near = MAX_FRAME_NOISE // 4
+        close = cv2.inRange(rgb, colour - near, colour + near) > 0
+        # Most of the parts is much closer to the colour than JPEG may leave it, unlike texture.
+        if 2 * np.count_nonzero(close & np.isin(labels, parts)) < areas[parts].sum():
+            return nowhere
+        frame = np.isin(
+            labels, [k for k in parts if _convex_hull((labels == k).astype(np.uint8))[1]]
+        )
     sides = [frame[0].any(), frame[-1].any(), frame[:, 0].any(), frame[:, -1].any()]
     # A sky may be as uniform, but it does not reach all four sides, and is not black.
-    enough = sum(sides) >= (4 if colour.any() else 3)
-    if not (smooth and enough) or frame.mean() > 1 - MIN_SCENE_SHARE:
-        return np.zeros(rgb.shape[:2], bool)
+    if sum(sides) < (4 if colour.any() else 3) or frame.mean() > 1 - MIN_SCENE_SHARE:
+        return nowhere
     return widened(frame, FRAME_MARGIN_PX)
 
 

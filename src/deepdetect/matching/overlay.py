@@ -134,12 +134,25 @@ def _same(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _contradicted(still: np.ndarray, pair: Pair, seed: int) -> np.ndarray:
     """Return the regions of still places that the motion between two reduced images contradicts."""
     size = still.shape[::-1]
+    _, labels = cv2.connectedComponents(np.uint8(widened(still, FRAME_MARGIN_PX)))
+    shift, known = _shifts(*pair)
+
+    def stands(places: np.ndarray) -> np.ndarray:
+        overlay = np.bincount(labels[places], minlength=labels.max() + 1) >= MIN_AREA_PX
+        for label in np.flatnonzero(overlay):
+            shifts = shift[places & (labels == label)]
+            whole = np.linalg.norm(np.median(shifts, axis=0))
+            each = np.median(np.linalg.norm(shifts, axis=1))
+            overlay[label] = whole < max(MAX_SHIFT_PX, MIN_UNITY * each)
+        return overlay
+
+    if not stands(still & known).any():  # before the matching, which takes longest
+        return np.zeros(still.shape, bool)
     tentative = find_tentative_matches(*pair)
     motion = tentative.points1 - tentative.points0
     moves = np.linalg.norm(motion, axis=1) > MAX_STILL_PX
     standing, scene, motion = tentative.points0[~moves], tentative.points0[moves], motion[moves]
     model = choose_model(scene, scene + motion, (size, size), "auto", seed, semi_calibrated=False)
-    shift, known = _shifts(*pair)
     exactly = still & known & (np.linalg.norm(shift, axis=2) < MAX_SHIFT_PX)
     column, row = np.rint(scene).astype(int).T
     tells = model.inliers & ~exactly[row, column]  # a keypoint that moves there is inexact
@@ -153,18 +166,10 @@ def _contradicted(still: np.ndarray, pair: Pair, seed: int) -> np.ndarray:
     moved = cv2.remap(pair[1], ends, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     clear = still & (least > MIN_MOTION_PX)
     shown = clear & known & ~_same(pair[0], moved)
-    region = widened(still, FRAME_MARGIN_PX)
-    _, labels = cv2.connectedComponents(np.uint8(region))
-    still_px, clear_px, shown_px = (
-        np.bincount(labels[where], minlength=labels.max() + 1) for where in (still, clear, shown)
+    still_px, clear_px = (
+        np.bincount(labels[where], minlength=labels.max() + 1) for where in (still, clear)
     )
-    likely = (shown_px >= MIN_AREA_PX) & (clear_px >= MIN_CLEAR_SHARE * still_px)
-    for label in np.flatnonzero(likely):
-        shifts = shift[shown & (labels == label)]
-        whole = np.linalg.norm(np.median(shifts, axis=0))
-        each = np.median(np.linalg.norm(shifts, axis=1))
-        likely[label] = whole < max(MAX_SHIFT_PX, MIN_UNITY * each)
-    return region & likely[labels]
+    return (stands(shown) & (clear_px >= MIN_CLEAR_SHARE * still_px))[labels]
 
 
 def _shifts(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
