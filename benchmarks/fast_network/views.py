@@ -19,7 +19,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deepdetect.io.image import load_image, luma, scale_short_side
+from deepdetect.io.image import load_image, luma
+from deepdetect_lab.datasets.scaling import scale_short_side
 from deepdetect_lab.labels import LABEL_SETTINGS, LabelOptions, fuse
 from deepdetect_lab.training.augmentation import augment, darken, draw_darkening
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import warnings
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from deepdetect.cli import main
 from deepdetect.geometry import transform_points
 from deepdetect.io.picture_file import read_metadata
 from deepdetect.sfm.georeference import read_control_points
@@ -44,38 +47,59 @@ def random_transform(generator: np.random.Generator) -> Any:
     return shift * rasterio.Affine.rotation(angle) * rasterio.Affine.scale(x, y)
 
 
-def rasters(generator: np.random.Generator, folder: Path) -> None:
-    """Read the place of a raster, write it to another file, and ask rasterio for both."""
+def as_bands(values: np.ndarray, count: int) -> np.ndarray:
+    """Repeat values in all bands, but for the fourth: GDAL makes it alpha."""
+    return np.array([values, values, values, np.full_like(values, 255), values, values][:count])
+
+
+def write_raster(generator: np.random.Generator, stem: Path, values: np.ndarray) -> Path:
+    """Write grey values, (H, W) uint8, to a raster of any kind that GDAL places somewhere."""
     import rasterio
 
-    transform, width, height = random_transform(generator), *map(int, generator.integers(2, 40, 2))
+    transform, (height, width) = random_transform(generator), values.shape
     kind = str(generator.choice(["tif", *WORLD_FILES]))
     system = str(generator.choice(SYSTEMS)) if generator.random() < 0.7 else None
-    path = folder / f"{generator.choice(['a', 'B c', 'ü'])}.{kind}"
     if kind == "tif" and generator.random() < 0.7:
-        dtype, count = str(generator.choice(TYPES)), int(generator.integers(1, 5))
+        dtype, count = str(generator.choice(TYPES)), int(generator.integers(1, 7))
         how = {"driver": "GTiff", "width": width, "height": height, "count": count}
+        how |= {"nodata": 0} if generator.random() < 0.3 else {}
+        path = stem.with_suffix(".tif")
         with rasterio.open(path, "w", dtype=dtype, crs=system, transform=transform, **how) as file:
-            file.write(generator.integers(0, 100, (count, height, width)).astype(dtype))
+            file.write(as_bands(values, count).astype(dtype))
             if generator.random() < 0.3:
                 file.update_tags(AREA_OR_POINT="Point")
-    else:
-        upper = generator.random() < 0.3
-        path = path.with_suffix(path.suffix.upper()) if upper else path
-        Image.new("RGB", (width, height)).save(path)
-        ending = str(generator.choice(WORLD_FILES[kind].split()))
-        ending = str(generator.choice([ending, ending.upper(), ending.capitalize()]))
-        centre = transform * rasterio.Affine.translation(0.5, 0.5)
-        numbers = (centre.a, centre.d, centre.b, centre.e, centre.c, centre.f)
-        path.with_suffix(f".{ending}").write_text("".join(f"{each!r}\n" for each in numbers))
+        return path
+    path = stem.with_suffix(f".{kind.upper() if generator.random() < 0.3 else kind}")
+    Image.fromarray(values).convert("RGB").save(path)
+    ending = str(generator.choice(WORLD_FILES[kind].split()))
+    ending = str(generator.choice([ending, ending.upper(), ending.capitalize()]))
+    centre = transform * rasterio.Affine.translation(0.5, 0.5)
+    numbers = (centre.a, centre.d, centre.b, centre.e, centre.c, centre.f)
+    path.with_suffix(f".{ending}").write_text("".join(f"{each!r}\n" for each in numbers))
+    return path
+
+
+def places(path: Path, pixels: np.ndarray) -> tuple[np.ndarray | None, Any]:
+    """Return the places of pixels (N, 2) as rasterio reads them, and the coordinate system."""
+    import rasterio
+
+    with rasterio.open(path) as file:
+        if file.transform.is_identity:
+            return None, file.crs
+        return np.array([file.transform * (x + 0.5, y + 0.5) for x, y in pixels]), file.crs
+
+
+def rasters(generator: np.random.Generator, folder: Path) -> None:
+    """Read the place of a raster, write it to another file, and ask rasterio for both."""
+    width, height = map(int, generator.integers(2, 40, 2))
+    values = generator.integers(0, 100, (height, width)).astype(np.uint8)
+    path = write_raster(generator, folder / str(generator.choice(["a", "B c", "ü"])), values)
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1]])
     found = read_metadata(path, placed=True)
     warnings.simplefilter("ignore")
-    with rasterio.open(path) as file:
-        placed, crs = not file.transform.is_identity, file.crs
-        expected = np.array([file.transform * (x + 0.5, y + 0.5) for x, y in corners])
-    expect((found.to_world is not None) == placed, "a place is lost, or made up")
-    if found.to_world is None:
+    expected, crs = places(path, corners)
+    expect((found.to_world is None) == (expected is None), "a place is lost, or made up")
+    if expected is None:
         return
     near = 1e-9 * np.abs(expected).max()
     expect(np.allclose(transform_points(corners, found.to_world), expected, 0, near), "elsewhere")
@@ -84,9 +108,69 @@ def rasters(generator: np.random.Generator, folder: Path) -> None:
     found.write_beside(folder / "out.png")
     Image.new("L", (width, height)).save(folder / "out.png")
     for name in ("out.tif", "out.png"):
-        with rasterio.open(folder / name) as file:
-            again = np.array([file.transform * (x + 0.5, y + 0.5) for x, y in corners])
+        again, _ = places(folder / name, corners)
         expect(np.allclose(again, expected, 0, near), f"{name} is elsewhere")
+
+
+def mosaics(generator: np.random.Generator, folder: Path) -> None:
+    """Register a picture to a raster, or stitch both; the result lies where the raster does."""
+    import cv2
+    import rasterio
+
+    scene = cv2.GaussianBlur(generator.random((130, 190)), (0, 0), 2)
+    scene = cv2.normalize(scene, None, 1, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    shift = int(generator.integers(30, 60))
+    raster, other = write_raster(generator, folder / "a", scene[:, :130]), folder / "b.png"
+    warnings.simplefilter("ignore")
+    with rasterio.open(raster) as file:
+        count = file.count
+    right = scene[:, shift:]
+    if count in (1, 3):
+        Image.fromarray(right).save(other)
+    else:
+        with rasterio.open(
+            other := folder / "b.tif", "w", "GTiff", *right.shape[::-1], count, dtype="uint8"
+        ) as file:
+            file.write(as_bands(right, count))
+    bands = [] if count in (1, 3) else ["--bands", "1", "2", "1"]
+    words = [str(raster), str(other), "--detector", "points", "--value-range", "0", "255", *bands]
+    if generator.random() < 0.5:
+        union = ["--extent", "union"] if generator.random() < 0.5 else []
+        words = ["register", *words, *union, "--output", str(folder / "out")]
+    else:
+        name = str(generator.choice(["p.tif", "p.png", "P.JPG"]))
+        scale = ["--scale", str(generator.choice([1.0, 0.7]))]
+        words = ["stitch", *words, "--reference", str(raster), *scale]
+        words += ["--output", str(folder / name)]
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        code = main(words)
+    expect(code == 0, said.getvalue())
+    corners, expected_crs = places(raster, np.array([[0, 0], [1, 0], [0, 1]]))
+    if corners is None:
+        return
+    (made,) = [
+        *folder.glob("out/b_on_a.[pt][ni][gf]"),
+        *(
+            each
+            for each in folder.glob("[pP].*")
+            if each.suffix.lower() in (".tif", ".png", ".jpg")
+        ),
+    ]
+    with rasterio.open(made) as file:
+        values = file.read(1).astype(float)
+    rows, columns = np.mgrid[10 : values.shape[0] - 10 : 3, 10 : values.shape[1] - 10 : 3]
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    there, crs = places(made, pixels)
+    expect(there is not None, "a place is lost")
+    axes = np.column_stack([corners[1] - corners[0], corners[2] - corners[0]])
+    xy = np.linalg.solve(axes, (there - corners[0]).T).T.astype(np.float32)
+    seen = (xy[:, 0] > shift + 2) & (xy[:, 0] < 186) & (xy[:, 1] > 2) & (xy[:, 1] < 126)
+    true = cv2.remap(scene, *xy[seen].T[:, None], cv2.INTER_LINEAR)[0]
+    alike = np.corrcoef(true, values[tuple(pixels[seen].T[::-1])])
+    expect(seen.sum() > 300 and alike[0, 1] > 0.97, f"{words[0]}: {made.name} is elsewhere")
+    kept = made.suffix == ".tif" or expected_crs is None
+    expect(crs == expected_crs or not kept, f"{made.name} has another coordinate system")
 
 
 def control_points(generator: np.random.Generator, folder: Path) -> None:
@@ -134,5 +218,6 @@ def control_points(generator: np.random.Generator, folder: Path) -> None:
 
 TARGETS = (
     Target("rasters", "places of rasters, against rasterio", rasters, 500, 100),
+    Target("mosaics", "registered and stitched rasters, against rasterio", mosaics, 500, 100),
     Target("control-points", "ground control points, against pyproj", control_points, 200, 100),
 )

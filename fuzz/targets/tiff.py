@@ -100,7 +100,8 @@ def expected_rgb(
     absent = np.zeros(values.shape, bool)
     if nodata is not None:
         absent = values == float(nodata.value)
-    exact = np.where(absent, 0, values).astype(np.float64)
+    hidden = absent.all(axis=2, keepdims=True)
+    exact = np.where(absent if dtype.kind == "f" else hidden, 0, values).astype(np.float64)
     if photometric == "PALETTE":
         rgb = np.moveaxis(colormap[:, values[:, :, 0]] // 256, 0, 2)
     else:
@@ -114,7 +115,7 @@ def expected_rgb(
     share = np.ones(rgb.shape[:2])
     if alpha is not None:
         share = alpha / (255 if alpha.dtype == np.uint8 else max(alpha.max(initial=0), 1))
-    share = np.where(absent.any(axis=2), 0, share).clip(0, 1)
+    share = np.where(hidden[..., 0], 0, share).clip(0, 1)
     if (share >= 0.5).any():  # otherwise alpha tells nothing
         share = np.where(share < 0.5, 0, share)[..., None]
         rgb = np.rint(rgb * share + 128 * (1 - share))

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import PointDetector, load_image, match_images, register, stitch
+from deepdetect.cli import main
 from deepdetect.io.image import load_visible
 
 HIDDEN = np.zeros((160, 200), bool)
@@ -85,21 +86,23 @@ def test_an_alpha_that_tells_nothing(scene: np.ndarray) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
-@pytest.mark.parametrize("how", ["inside", "beside", "value 0", "nan"])
+@pytest.mark.parametrize("how", ["inside", "beside", "planes", "value 0", "nan"])
 def test_masks_and_no_data_of_gdal(how: str, scene: np.ndarray, tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio")
     grey = scene[:160, :200, 0].copy()
     values = np.where(HIDDEN, np.nan, grey / 255).astype("f4") if how == "nan" else grey
     if how == "value 0":
         values[HIDDEN] = 0
-    kind = {"driver": "GTiff", "width": 200, "height": 160, "count": 1, "dtype": values.dtype}
+    count = 3 if how == "planes" else 1
+    kind = {"driver": "GTiff", "width": 200, "height": 160, "count": count, "dtype": values.dtype}
     kind |= {"nodata": 0} if how == "value 0" else {}
+    kind |= {"interleave": "band", "photometric": "RGB"} if how == "planes" else {}
     with (
-        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=how == "inside"),
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=how != "beside"),
         rasterio.open(tmp_path / "a.tif", "w", **kind) as file,
     ):
-        file.write(values, 1)
-        if how in ("inside", "beside"):
+        file.write(np.stack([values] * count))
+        if how in ("inside", "beside", "planes"):
             file.write_mask(alpha_of(HIDDEN))
     rgb, hidden = load_visible(tmp_path / "a.tif")
     np.testing.assert_array_equal(hidden, HIDDEN)
@@ -135,6 +138,28 @@ def test_a_panorama_keeps_the_numbers_of_its_images(scene: np.ndarray) -> None:
     found = stitch([first, second], PointDetector(2000), reference=0)
     differences = np.abs(found.image[5:155, 5:195, 0].astype(int) - first[5:155, 5:195])
     assert np.median(differences) < 20
+
+
+@pytest.mark.parametrize("dtype", ["i2", "f4", "u2"])
+def test_rasters_are_stitched_in_their_own_type(
+    dtype: str, scene: np.ndarray, tmp_path: Path
+) -> None:
+    tifffile = pytest.importorskip("tifffile")
+    grey = (scene[..., 0] * 0.5 - (0 if dtype == "u2" else 100)).astype(dtype)
+    grey[:10, :20] = -99 if dtype != "u2" else 999
+    no_data = [(42113, "s", 0, str(grey[0, 0]), True)]
+    paths = [tmp_path / "a.tif", tmp_path / "b.tif"]
+    for path, part in zip(paths, (grey[:160, :200], grey[:160, 80:280]), strict=True):
+        tifffile.imwrite(path, part, extratags=no_data)
+    options = ["--value-range", "-100", "30"] if dtype != "u2" else ["--value-range", "0", "200"]
+    output = tmp_path / "c.tif"
+    run = ["stitch", *paths, "-o", output, "--reference", paths[0], *options]
+    assert main([*map(str, run), "--detector", "points"]) == 0
+    found = tifffile.imread(output)
+    assert found.dtype == dtype
+    assert found.ndim == 2
+    assert found[4, 4] == grey[0, 0]
+    assert np.median(np.abs(found[15:155, 30:195] - grey[15:155, 30:195].astype(float))) < 1
 
 
 def test_registered_images_keep_their_numbers_and_holes(scene: np.ndarray) -> None:

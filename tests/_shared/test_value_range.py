@@ -98,8 +98,10 @@ def test_what_does_not_fit_the_range_of_a_folder_is_told(tmp_path: Path) -> None
 
 def test_images_of_8_bits_have_no_common_range() -> None:
     small = RNG.integers(0, 256, (100, 120)).astype(np.uint8)
-    with one_range([small, photograph(12)]) as reading:
+    with one_range([small, small]) as reading:
         assert reading.deep_range is None
+    with one_range([small, photograph(12), photograph(10)]) as reading:
+        assert reading.deep_range == (0, 4095)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_pixels(photograph(12), deep=True).dtype == np.uint16

@@ -250,3 +250,14 @@ def test_positions_are_as_uncertain_as_the_network_sees_them(
         extract_features(tmp_path / "photos", file, detector, workers=1)
         with h5py.File(file, "r", libver="latest") as opened:
             assert opened["a.png"]["keypoints"].attrs["uncertainty"] == expected
+
+
+@pytest.mark.filterwarnings("ignore:.*give the range")
+def test_images_that_are_added_are_read_by_the_range_of_the_others(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).integers(7000, 7301, (120, 160)).astype(np.uint16)
+    (tmp_path / "photos").mkdir()
+    for number in (0, 1):
+        Image.fromarray(values + 99 * number).save(tmp_path / f"photos/{number}.png")
+        report = extract_features(tmp_path / "photos", tmp_path / "f.h5", FEW, workers=1)
+        assert report.skipped == number
+        assert len(report.counts) == 1

@@ -52,7 +52,7 @@ def ros(
         "image_width: 640\nimage_height: 480\ncamera_name: narrow_stereo/left\n"
         + rows("camera_matrix", raw)
         + "distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n"
-        + "  data: [-0.36, 0.11, 0.001, 0.0005, 0.0]\n"
+        + f"  data: [{distortion}]\n"
         + rows("rectification_matrix", np.eye(3))
         + rows("projection_matrix", projection(matrix, right_mm, 1000))
     )
@@ -185,7 +185,7 @@ roi:
 """
 ROS2 = "height: 480\nwidth: 640\nd:\n- 0.0\n- 0.0\nk:\n" + "".join(f"- {v}\n" for v in LEFT.ravel())
 SINGLE = {
-    "ROS": ros(LEFT, 0),
+    "ROS": ros(LEFT, 0, "0.0, 0.0, 0.0, 0.0, 0.0"),
     "rostopic echo": ROSTOPIC + "---\n",
     "ros2 topic echo": ROS2 + "---\n",
     "EuRoC": euroc(LEFT, 0.1),

@@ -210,6 +210,7 @@ SINGLE: dict[str, Any] = {
     ),
     "Metashape": XML,
     "Metashape, cameras": metashape(ADJUSTED),
+    "PhotoScan before 1.2": OLD_PHOTOSCAN,
     "nerfstudio": {"camera_model": "OPENCV", **NERF, "frames": FRAMES},
     "nerfstudio, frames": {"frames": [{**NERF, **frame} for frame in FRAMES]},
     "MATLAB": MATLAB,
@@ -377,7 +378,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "OpenMVG without cameras": ({**openmvg({}), "intrinsics": []}, "cameras"),
     "ORB-SLAM without fx": ("Camera.type: PinHole\nCamera.bf: 40.0\n", "ORB-SLAM.*fx"),
     "ZED without STEREO": (section("LEFT_CAM_VGA", CX) + section("RIGHT_CAM_VGA", CX), "STEREO"),
-    "PhotoScan before 1.2": (OLD_PHOTOSCAN, "Metashape.* f:"),
+    "PhotoScan before 1.2 with skew": (OLD_PHOTOSCAN.replace("w>0", "w>2"), "Metashape.*skew"),
     "a chunk without cameras": ("<document><chunk><sensors/></chunk></document>", "Metashape"),
     "another size": ({**REALSENSE, "width": 1280, "height": 720}, "RealSense.*1280x720"),
     "an unknown key of a side": ({"focal_px": 500, "left": {"k1": -0.1}}, "k1"),
@@ -421,3 +422,181 @@ def test_any_3x3_matrix_is_a_camera_or_refused(tmp_path: Path) -> None:
             read += 1
             np.testing.assert_array_equal(found.camera0.matrix, matrix)
     assert read
+
+
+OST = """# oST version 5.0 parameters
+
+[image]
+
+width
+640
+
+height
+480
+
+[narrow_stereo]
+
+camera matrix
+509 0 315.5
+0 511 247.25
+0 0 1
+
+distortion
+{} 0 0 0 0
+
+projection
+500 0 310.5 0
+0 502 242.25 0
+0 0 1 0
+"""
+RGBD = """Intrinsic of "Color" / 1280x720
+  Width: \t1280
+  Height: \t720
+  PPX: \t640
+  PPY: \t360
+  Fx: \t900
+  Fy: \t900
+  Coeffs: \t0 0 0 0 0
+
+Intrinsic of "Color" / 640x480
+  Width: \t640
+  Height: \t480
+  PPX: \t310.5
+  PPY: \t242.25
+  Fx: \t500
+  Fy: \t502
+  Coeffs: \t0 0 0 0 0
+"""
+OTHERS: dict[str, Any] = {
+    "ROS, ost.txt": OST.format(0),
+    "RealSense, printed": RGBD,
+    "numpy, printed": "K:\n [[500.   0. 310.5]\n [  0. 502. 242.25]\n [0. 0. 1.]]\nD: [0. 0.]\n",
+    "MVSNet": "extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n\n"
+    "intrinsic\n500 0 310.5\n0 502 242.25\n0 0 1\n\n425 2.5\n",
+    "DSO": "Pinhole 500 502 310.5 242.25 0\n640 480\nnone\n640 480\n",
+    "DSO, fractions": f"RadTan {FX / 640} {FY / 480} {311 / 640} {242.75 / 480} 0 0 0 0\n"
+    "640 480\ncrop\n640 480\n",
+    "vikit": "cam_model: Pinhole\n"
+    + "".join(f"cam_{key}: {ROW[key]}\n" for key in ROW)
+    + "cam_d0: 0\n",
+    "aslam": {"intrinsics": {"rows": 4, "cols": 1, "data": [*ROW.values()]}, "type": "pinhole"},
+    "iOS, by columns": {"K": BY_COLUMNS, "w": 640, "h": 480},
+    "4x4 in JSON": {"intrinsic": [[FX, 0, CX, 0], [0, FY, CY, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+    "mtx": {"mtx": MATRIX, "dist": [[0, 0, 0, 0, 0]]},
+    "MATLAB, struct": {**MATLAB, "NumRadialDistortionCoefficients": 2, "EstimateSkew": False},
+    "JSON with comments": '[{"fx": 500, "fy": 502, # px\n"cx": 310.5, "cy": 242.25,}]',
+    "KITTI, one camera": "P_rect_02: 500 0 310.5 44.8 0 502 242.25 0.2 0 0 1 0.003\n",
+    "ROS, whole": {"k": [*np.ravel(MATRIX)], "binning_x": 1, "roi": {"x_offset": 0, "width": 640}},
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_files_of_other_programs(name: str, tmp_path: Path) -> None:
+    found = load(tmp_path, OTHERS[name])
+    for camera in (found.camera0, found.camera1):
+        np.testing.assert_allclose(camera.matrix, CAMERA.matrix, rtol=0, atol=1e-9)
+    assert found.baseline_mm is None
+
+
+PAIR = {"left": ROW, "right": {**ROW, "cx": 326.0}}
+MOVED = np.eye(4)
+MOVED[0, 3] = 0.12
+PAIRS: dict[str, Any] = {
+    "baseline_mm": {**PAIR, "stereo": {"baseline_mm": 120}},
+    "baseline in m": {**PAIR, "baseline_m": 0.12},
+    "baseline_cm": {**PAIR, "baseline_cm": 12},
+    "baseline under 1": {**PAIR, "baseline": 0.12},
+    "baseline over 30": {**PAIR, "stereo_baseline": -120},
+    "mtxL": {"mtxL": MATRIX, "mtxR": [[FX, 0, 326], *MATRIX[1:]], "T": [[-0.12], [0], [0]]},
+    "OKVIS": {
+        "cameras": [
+            {"focal_length": [FX, FY], "principal_point": [cx, CY], "T_SC": list(pose.ravel())}
+            for cx, pose in ((CX, np.eye(4)), (326.0, MOVED))
+        ]
+    },
+    "MATLAB": {
+        "CameraParameters1": MATLAB,
+        "CameraParameters2": {
+            **MATLAB,
+            "IntrinsicMatrix": [[FX, 0, 0], [0, FY, 0], [327, CY + 1, 1]],
+        },
+        "TranslationOfCamera2": [-120, 0, 0],
+    },
+    "Kalibr, poses in a list": {
+        f"cam{i}": {
+            "camera_model": "pinhole",
+            "intrinsics": [FX, FY, cx, CY],
+            "T_cn_cnm1": [float(n) for n in MOVED.ravel()] if i else None,
+        }
+        for i, cx in enumerate((CX, 326.0))
+    },
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_baseline_has_the_unit_of_its_name_or_program(name: str, tmp_path: Path) -> None:
+    found = load(tmp_path, PAIRS[name])
+    assert (found.camera0, found.camera1) == (CAMERA, RIGHT)
+    assert found.baseline_mm == pytest.approx(120)
+    found.save(tmp_path / "calib.json")
+    again = Calibration.load(tmp_path / "calib.json")
+    assert (again.camera0, again.camera1, again.baseline_mm) == (CAMERA, RIGHT, found.baseline_mm)
+
+
+def test_a_baseline_that_may_be_in_any_unit_is_told(tmp_path: Path) -> None:
+    for values in ({**ROW, "baseline": 12}, {"M1": MATRIX, "M2": MATRIX, "T": [-3.3, 0, 0]}):
+        with pytest.warns(UserWarning, match="baseline_mm"):
+            found = load(tmp_path, values)
+        assert (found.camera0, found.baseline_mm) == (CAMERA, None)
+
+
+def test_distortion_beside_a_projection_matrix_is_told(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="distortion"):
+        assert load(tmp_path, OST.format(-0.3)).camera0 == CAMERA
+
+
+def test_cameras_of_kitti_that_are_missing_are_told(tmp_path: Path) -> None:
+    row = "500 0 310.5 {} 0 502 242.25 0 0 0 1 0\n"
+    path = tmp_path / "calib.txt"
+    path.write_text("P2: " + row.format(0) + "P3: " + row.format(-60))
+    with pytest.warns(UserWarning, match="0 and 1"):
+        found = Calibration.load(path, SIZE, views=(0, 1))
+    assert found.baseline_mm == pytest.approx(120)
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ({**ROW, "doffs": 15.5, "baseline": 120}, "15.5"),
+        ({"k": [*np.ravel(MATRIX)], "binning_x": 2}, "binning"),
+        ({"K": [*np.ravel(MATRIX)], "roi": {"x_offset": 16}}, "x_offset"),
+        ({"K": {"rows": 3, "cols": 3, "dt": "d", "data": "$base64$OWQg"}}, "base64"),
+        ("0.6 0.9 0.5 0.5 0.9\n640 480\ncrop\n640 480\n", "fov"),
+        ("cam_model: ATAN\n" + "".join(f"cam_{k}: {v}\n" for k, v in ROW.items()), "ATAN"),
+        ("721.5 721.5 0.0 609.6 172.9 0.537", "6 numbers"),
+        ("A report\n\n  Name : project: one\n  f 35 mm\n", "cameras"),
+        ("cam0:\n  camera_model: pinhole\n  distortion_coeffs: [0.1, 0]\n", "distortion"),
+        (OST.format(-0.3).partition("projection")[0], "distortion"),
+    ],
+    ids=str,
+)
+def test_refusals_give_the_true_reason(content: Any, word: str, tmp_path: Path) -> None:
+    with pytest.raises(ReconstructionError, match=word) as error:
+        load(tmp_path, content)
+    assert "damaged" not in str(error.value)
+
+
+def test_a_file_that_is_no_text_is_refused_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "camera.npz"
+    np.savez(path, K=np.eye(3))
+    with pytest.raises(ReconstructionError, match="text"):
+        Calibration.load(path, SIZE)
+
+
+def test_zeros_of_opencv_are_no_fisheye(tmp_path: Path) -> None:
+    values = "<fisheye_model>0</fisheye_model><K><rows>3</rows><cols>3</cols><data>{}</data></K>"
+    numbers = " ".join(map(str, np.ravel(MATRIX)))
+    assert (
+        load(tmp_path, f"<opencv_storage>{values.format(numbers)}</opencv_storage>").camera0
+        == CAMERA
+    )

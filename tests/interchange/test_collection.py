@@ -51,6 +51,19 @@ def test_descriptors_come_from_the_photographs(photo: np.ndarray, tmp_path: Path
     assert describe_collection(Collection({"q.png": points})).keypoints["q.png"].descriptors is None
 
 
+def test_photographs_of_16_bits_have_one_range(photo: np.ndarray, tmp_path: Path) -> None:
+    gray = luma(photo).astype(np.uint16)
+    for name, factor in {"dark.png": 4, "light.png": 16}.items():
+        Image.fromarray(gray * factor).save(tmp_path / name)
+    points = PointDetector(50).detect(photo)
+    found = describe_collection(
+        Collection(dict.fromkeys(["dark.png", "light.png"], points), {}, tmp_path)
+    )
+    dark = np.rint(gray * 4 * (255 / 4095)).astype(np.uint8)
+    expected = describe_keypoints(dark, points).descriptors
+    np.testing.assert_array_equal(found.keypoints["dark.png"].descriptors, expected)
+
+
 def test_descriptors_as_bytes() -> None:
     rng = np.random.default_rng(0)
     bytes_ = rng.integers(0, 255, (4, 128)).astype(np.uint8)

@@ -134,6 +134,34 @@ def test_what_altitudes_refer_to(reference: int | None, sign: int, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
+    ("version", "reference", "expected"),
+    [
+        (b"0232", 0, "sea"),
+        (b"0300", 0, "ellipsoid"),
+        (b"0300", 1, "ellipsoid"),
+        (b"0300", 3, "sea"),
+    ],
+)
+def test_heights_of_exif_3(version: bytes, reference: int, expected: str, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.ExifVersion] = version
+    tags = place_tags(10, 20, 5.0) | {GPS.GPSAltitudeRef: bytes([reference])}
+    exif.get_ifd(IFD.GPSInfo).update(tags)
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+    fix = read_gps(tmp_path / "a.jpg")
+    assert fix is not None
+    assert expected in fix.reference
+    assert fix.altitude == (-5 if reference in (1, 3) else 5)
+
+
+def test_degrees_without_minutes_or_seconds(tmp_path: Path) -> None:
+    tags = place_tags(10, 20) | {GPS.GPSLatitude: (10.5,), GPS.GPSLongitude: (20.0, 15.0)}
+    fix = read_gps(write_photograph(tmp_path / "a.jpg", tags))
+    assert fix is not None
+    assert (fix.latitude, fix.longitude) == (10.5, 20.25)
+
+
+@pytest.mark.parametrize(
     "tags", [{}, place_tags(0, 0), {GPS.GPSLatitudeRef: "N"}, place_tags(91, 5)]
 )
 def test_what_is_no_place_is_none(tmp_path: Path, tags: dict) -> None:

@@ -5,15 +5,14 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from natsort import natsorted, ns
 from PIL import Image, ImageOps
 
 from deepdetect._shared.errors import ImageError
-from deepdetect.io.image import find_images, load_image, luma, scale_short_side
+from deepdetect.io.image import find_images, load_image, luma
 from deepdetect.io.image_file import IMAGE_SUFFIXES
 
 OneLine = Callable[[BaseException], str]
@@ -239,6 +238,16 @@ def test_bad_arrays(kind: str) -> None:
         load_image(BAD_ARRAYS[kind])
 
 
+@pytest.mark.parametrize("bits", [12, 16])
+def test_colours_of_16_bits_in_jpeg_2000(bits: int) -> None:
+    values = np.random.default_rng(0).integers(0, 1 << bits, (40, 50, 3)).astype(np.uint16)
+    done, content = cv2.imencode(".jp2", values, [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, 1000])
+    assert done
+    rgb = load_image(content.tobytes())
+    expected = values[..., ::-1] * (255 / (2**bits - 1))
+    assert np.abs(rgb - expected).max() < 4
+
+
 def test_luma_is_bt601(photo: np.ndarray) -> None:
     exact = photo @ np.array([0.299, 0.587, 0.114])
     assert np.abs(luma(photo) - exact).max() < 0.51
@@ -266,17 +275,3 @@ def test_broken_exif_is_no_broken_picture(tmp_path: Path) -> None:
     with Image.open(path) as opened, pytest.raises((struct.error, ZeroDivisionError)):
         ImageOps.exif_transpose(opened)
     assert load_image(path).shape == (30, 20, 3)
-
-
-@given(height=st.integers(16, 300), width=st.integers(16, 300), side=st.integers(16, 300))
-def test_the_short_side_is_exact_and_the_shape_is_kept(height: int, width: int, side: int) -> None:
-    scaled = scale_short_side(np.zeros((height, width, 3), np.uint8), side)
-    assert min(scaled.shape[:2]) == side
-    factor = side / min(height, width)
-    assert scaled.shape[0] == pytest.approx(height * factor, abs=0.5)
-    assert scaled.shape[1] == pytest.approx(width * factor, abs=0.5)
-
-
-def test_shrinking_averages_areas(photo: np.ndarray) -> None:
-    sums = photo.astype(int).reshape(64, 4, 64, 4, 3).sum((1, 3))
-    assert np.abs(scale_short_side(photo, 64) - sums / 16).max() <= 0.5

@@ -330,16 +330,18 @@ def test_without_rasterio_a_place_is_said_not_lost(
     photo: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     geotiff(tmp_path / "a.tif", photo, place())
-    save_picture(photo, tmp_path / "b.png")
     save_picture(photo, tmp_path / "c.jpg")
     (tmp_path / "c.wld").write_text("1 0 0 1 0 0")
+    for name, text in (("b", "<Metadata>"), ("d", "<GeoTransform>0, 1, 0, 0, 0, 1")):
+        save_picture(photo, tmp_path / f"{name}.png")
+        (tmp_path / f"{name}.png.aux.xml").write_text(f"<PAMDataset>{text}")
     find = importlib.util.find_spec
     monkeypatch.setattr(
         "importlib.util.find_spec", lambda name: None if name == "rasterio" else find(name)
     )
     np.testing.assert_array_equal(load_image(tmp_path / "a.tif"), photo)
     assert read_metadata(tmp_path / "b.png", placed=True).to_world is None
-    for name in ("a.tif", "c.jpg"):
+    for name in ("a.tif", "c.jpg", "d.png"):
         assert read_metadata(tmp_path / name).to_world is None
         words = f"the georeference of {tmp_path / name} needs the package rasterio: run pip"
         with pytest.raises(MissingExtraError, match=re.escape(words)):

@@ -109,8 +109,12 @@ def test_ranges_are_given_for_signed_and_large_numbers() -> None:
 
 @pytest.mark.parametrize(
     "values",
-    [(GREY / 2550).astype(np.float32), (GREY // 10).astype(np.uint16)],
-    ids=["floats", "16 bits"],
+    [
+        (GREY / 2550).astype(np.float32),
+        (0.8 + GREY / 2550).astype(np.float16),
+        (GREY // 10).astype(np.uint16),
+    ],
+    ids=["dark floats", "light floats", "16 bits"],
 )
 def test_numbers_that_use_little_of_their_range_are_told(values: np.ndarray) -> None:
     with pytest.warns(UserWarning, match="`value_range`"):
@@ -222,6 +226,14 @@ def test_what_is_no_data_is_grey() -> None:
     np.testing.assert_array_equal(load_image(content), found)
 
 
+def test_the_value_of_no_data_in_one_band_is_a_colour() -> None:
+    values = np.maximum(COLOUR, 1)
+    values[:4], values[4:8, :, 1] = 0, 0
+    found = load_image(written(values, extratags=[(42113, "s", 0, "0", True)]))
+    assert (found[:4] == 128).all()
+    np.testing.assert_array_equal(found[4:], values[4:])
+
+
 REFUSED = {
     "CIELab": written(COLOUR, photometric="cielab"),
     "CMYK of 16 bits": written(np.dstack([DEEP, DEEP[:, :, 0]]), photometric="separated"),
@@ -261,6 +273,8 @@ def test_without_imagecodecs_pillow_decodes_what_it_decodes_rightly(
         written(COLOUR, photometric="rgb", compression="lzw"),
         written(GREY, photometric="miniswhite", compression="lzw"),
         written(DEEP[:, :, 0], photometric="minisblack", compression="lzw"),
+        written(GREY, compression="lzw", extratags=[(42113, "s", 0, str(GREY[0, 0]), True)]),
+        written(np.dstack([GREY, GREY]), compression="lzw", extrasamples=["unassalpha"]),
     ]
     before = [load_image(content) for content in fine]
     deep = written(DEEP, photometric="rgb", compression="lzw")

@@ -125,6 +125,19 @@ def test_other_lines_are_refused(line: str, tmp_path: Path) -> None:
         read(tmp_path, "EPSG:32633", line)
 
 
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_tables_as_spreadsheets_write_them(separator: str, tmp_path: Path) -> None:
+    """They fill up short lines, and end lines as DOS does."""
+    lines = ["EPSG:32633" + 6 * separator, separator.join(USUAL), ""]
+    path = tmp_path / "gcp.csv"
+    path.write_bytes("\r\n".join(lines).encode())
+    (row,) = read_control_points(path)
+    assert (row.name, row.image, row.place[2]) == ("north wall", "DJI 1.JPG", 12.5)
+    path.write_bytes("\n".join(lines).replace("wall", "W\u00e4nde").encode("latin-1"))
+    with pytest.raises(OptionError, match="UTF-8"):
+        read_control_points(path)
+
+
 def test_degrees_in_the_wrong_order_and_unknown_heights(tmp_path: Path) -> None:
     (row,) = read(tmp_path, "EPSG:4326", "lat lon alt px py image", "48.7 15 nan 1 2 a.jpg")
     assert row.place[:2] == pytest.approx((48.7, 15))

@@ -121,8 +121,7 @@ def test_a_smaller_view_sees_the_same_directions(monkeypatch: pytest.MonkeyPatch
 def test_what_was_extracted_is_not_too_large(tmp_path: Path, photo: np.ndarray) -> None:
     Image.fromarray(photo).save(tmp_path / "a.png")
     camera = CameraIntrinsics("PINHOLE", photo.shape[1::-1], (1.0, 1.0, 0.0, 0.0))
-    with read_with(
-        reading_options(max_megapixels=1e-3)
-    ):  # as in another process than that of the command
-        rgb = depth_maps._undistorted(tmp_path / "a.png", (0, 0), camera, camera.pinhole)
+    limited = reading_options(max_megapixels=1e-3)
+    with read_with(limited):  # as in another process than that of the command
+        rgb = depth_maps._undistorted(tmp_path / "a.png", (0, 0), camera, camera.pinhole, limited)
     np.testing.assert_array_equal(rgb, photo)

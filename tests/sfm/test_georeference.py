@@ -302,9 +302,52 @@ def test_a_bent_model_is_no_mistake_of_the_points(
     bent = utm.copy()
     bent[:, 2] += 2.5 * ((marks[:, 0] - 30) / 30) ** 2
     control = read_control_points(survey_file(tmp_path / "g.txt", "EPSG:32632", bent, shown))
-    found = georeference(sparse, sparse.points, tmp_path, control)
+    with pytest.warns(UserWarning, match="bent"):
+        found = georeference(sparse, sparse.points, tmp_path, control)
     assert isinstance(found, Georeference)
     assert found.summary()["median_residual_up_m"] > 0.05
+
+
+@pytest.mark.parametrize("size", [1, 30])
+@pytest.mark.parametrize("count", [5, 8])
+def test_errors_at_random_are_no_bend_in_a_model_of_any_size(
+    pycolmap, size: float, count: int, tmp_path: Path, hidden: Similarity
+) -> None:
+    """20 metres across models of 60 and of 1800 metres."""
+    sparse, marks, _, shown = surveyed(replace(hidden, scale=hidden.scale * size))
+    marks = size * marks + np.random.default_rng(count).uniform(-20, 20, marks.shape)
+    utm, _ = ORIGIN.to_utm(marks)
+    shown = [mark for mark in shown if mark[1] < count]
+    control = read_control_points(survey_file(tmp_path / "g.txt", "EPSG:32632", utm, shown))
+    with pytest.raises(NoPlaceError):
+        georeference(sparse, sparse.points, tmp_path, control)
+
+
+def test_a_model_across_the_antimeridian(pycolmap, tmp_path: Path, hidden: Similarity) -> None:
+    sparse, marks, _, shown = surveyed(hidden)
+    places = (marks - np.median(marks, axis=0)) @ np.diag([1 / 106_480, 1 / 110_650, 1])
+    places += [180, -17, 10]
+    places[:, 0] -= 360 * (places[:, 0] > 180)  # four points of eight
+    control = read_control_points(survey_file(tmp_path / "g.txt", "EPSG:4326", places, shown))
+    found = georeference(sparse, sparse.points, tmp_path, control)
+    assert isinstance(found, Georeference)
+    assert found.origin is not None
+    assert abs(found.origin.longitude) == pytest.approx(180, abs=0.001)
+    assert found.similarity.scale == pytest.approx(hidden.scale, rel=0.01)
+    assert tilt_error_deg(found.similarity, hidden) < 1
+
+
+def test_remarks_behind_names_make_no_further_points(
+    pycolmap, tmp_path: Path, hidden: Similarity
+) -> None:
+    sparse, _, utm, shown = surveyed(hidden)
+    path = survey_file(tmp_path / "g.txt", "EPSG:32632", utm, shown)
+    lines = path.read_text().splitlines()
+    remarked = [f"{line} remark {k}" for k, line in enumerate(lines[1:])]
+    path.write_text("\n".join([lines[0], *remarked]))
+    found = georeference(sparse, sparse.points, tmp_path, read_control_points(path))
+    assert isinstance(found, Georeference)
+    assert found.summary()["used"] == len(utm)
 
 
 @pytest.mark.parametrize("system", ["EPSG:2249", "EPSG:2249+6360", "EPSG:2249+5703", "EPSG:26986"])

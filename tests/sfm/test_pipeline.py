@@ -11,6 +11,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageOps
@@ -250,6 +251,24 @@ def test_dense_matches_give_more_and_longer_tracks(small, tmp_path: Path, shared
     truth = true_views(shared)
     errors = [relative_rotation_error(each.views, truth) for each in (many, found)]
     assert errors[0] < errors[1] + 0.2
+
+
+@pytest.mark.slow
+def test_images_of_16_bits_have_one_range_in_every_file(
+    write_fountain, tmp_path: Path, pycolmap
+) -> None:
+    factors = {"0004": 4, "0005": 16, "0006": 16}
+    folder = write_fountain(tmp_path / "photos", factors, 288)
+    for name, factor in factors.items():
+        bgr = cv2.imread(str(folder / f"{name}.jpg")).astype(np.uint16)
+        cv2.imwrite(str(folder / f"{name}.png"), bgr * factor)
+        (folder / f"{name}.jpg").unlink()
+    options = MultiViewOptions(stride_px=4, formats=("splat",))
+    reconstruct_many(folder, tmp_path / "model", **{**QUICK, "options": options})
+    means = {
+        path.stem: cv2.imread(str(path)).mean() for path in tmp_path.glob("model/splat/images/*")
+    }
+    assert means["0004"] < 0.4 * min(means["0005"], means["0006"])
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 
 from .alpha import on_grey
 from .errors import ImageError, check_name
-from .value_range import range_of_uint16, tell_if_little
+from .value_range import ValueRange, counts_of, range_of_uint16, tell_if_little
 
 Channels = Literal["rgb", "bgr"]
 CHANNEL_COUNTS = (1, 3, 4)
@@ -55,13 +55,16 @@ def array_to_pixels(
     value_range: Sequence[float] | None = None,
     bands: Sequence[int] | None = None,
     white: int | None = None,
+    call: ValueRange | None = None,
+    counts: np.ndarray | None = None,
     deep: bool = False,
 ) -> np.ndarray:
     """Convert an array or PyTorch tensor to an (H, W, 3) RGB image, or (H, W, 4) as in `alpha`.
 
     The result is uint8 or, if `deep` is set and the input has more than 8 bits, uint16. `white` is
-    the value of white in an unsigned image, if known. `name` is the image's name in messages. The
-    other arguments are as in `load_image`.
+    the value of white in an unsigned image, if known. `call` is the range of the uint16 images of a
+    call that state no white; `counts`, to which their values are added, serves to find it. `name`
+    is the image's name in messages. The other arguments are as in `load_image`.
 
     Raises:
         ImageError: the image has an unsupported shape, type or range, or contains NaN.
@@ -74,9 +77,11 @@ def array_to_pixels(
     array = _channels_last(array)
     if array.dtype.kind not in "buif":
         raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
+    colours = array[:, :, :3] if array.ndim == 3 else array
+    if counts is not None and array.dtype == np.uint16 and white is None:
+        counts += counts_of(colours)
     if value_range is None:
-        colours = array[:, :, :3] if array.ndim == 3 else array
-        value_range = _range_of(colours, name, white)
+        value_range = _range_of(colours, name, white, call)
     values = _in_range(array, value_range, name, deep)
     if values.ndim == 2:
         return np.repeat(values[:, :, None], 3, axis=2)
@@ -157,7 +162,9 @@ def _select_bands(array: np.ndarray, bands: Sequence[int], name: str) -> np.ndar
     return array[:, :, np.array(bands) - 1]
 
 
-def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, float]:
+def _range_of(
+    array: np.ndarray, name: str, white: int | None, call: ValueRange | None
+) -> ValueRange:
     """Return the values that mean black and white in an image of this type."""
     kind, size = array.dtype.kind, array.dtype.itemsize
     if kind == "b":
@@ -166,8 +173,8 @@ def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, f
         return 0, white or 255
     if kind == "u" and size == 2:
         if white is None:
-            return range_of_uint16(array, name)
-        tell_if_little(int(array.max(initial=0)) / white, name)
+            return range_of_uint16(array, name, call)
+        tell_if_little(array, white, name)
         return 0, white
     if kind == "f":
         low, high = (float(array.min()), float(array.max())) if array.size else (0.0, 1.0)
@@ -175,7 +182,7 @@ def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, f
             raise ImageError(
                 f"{name} spans [{low:g}, {high:g}]: scale floats to [0, 1], or give `value_range`"
             )
-        tell_if_little(high, name)
+        tell_if_little(array, 1, name)
         return 0, 1
     raise ImageError(
         f"{name} is {array.dtype}, whose range is unknown: give `value_range`, or convert it to "

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 
 import numpy as np
 
@@ -22,34 +20,26 @@ to one in a thousand. Chosen by hand."""
 
 ValueRange = tuple[float, float]
 
-_call: ContextVar[ValueRange | np.ndarray | None] = ContextVar("range of call", default=None)
 
+def range_of_uint16(array: np.ndarray, name: str, call: ValueRange | None) -> ValueRange:
+    """Return the values of black and white of a uint16 image that does not state them.
 
-@contextmanager
-def range_of_call(values: ValueRange | np.ndarray | None) -> Iterator[None]:
-    """Read uint16 images in the block with one range, or add up the counts of their values."""
-    token = _call.set(values)
-    try:
-        yield
-    finally:
-        _call.reset(token)
-
-
-def range_of_uint16(array: np.ndarray, name: str) -> ValueRange:
-    """Return the values of black and white of a uint16 image that does not state them."""
-    counts = np.bincount(array.ravel(), minlength=1 << 16)
-    call = _call.get()
+    They are those of all images of the `call`, if it has several.
+    """
+    counts = counts_of(array)
     if call is None:
         return find_range(counts, name)
-    if isinstance(call, np.ndarray):
-        call += counts
-        return find_range(counts)
     low, high = map(round, call)
     outside = (counts[1 : max(1, low)].sum() + counts[high + 1 : -1].sum()) / counts.sum()
     if outside > MAX_OUTLIERS:
         what = f"{outside:.1%} of {name} lies outside {low} to {high}, the range of other images"
         warnings.warn(f"{what}: give the range by `value_range`", UserWarning, stacklevel=2)
     return call
+
+
+def counts_of(values: np.ndarray) -> np.ndarray:
+    """Count each of the 65536 values of a uint16 array."""
+    return np.bincount(values.ravel(), minlength=1 << 16)
 
 
 def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
@@ -72,19 +62,28 @@ def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
     padded = counts[65535] > shares[0]
     if counts[white + 1 : 2 * white + 2].any() or (padded and white < 256):
         white, high = full, 65535 if padded else high
+    if name is not None:
+        _tell_if_little(low, high, white, name)
     width = high - low
-    narrow = 0 < width < min(low, LITTLE_RANGE * white)
-    if name is not None and (narrow or high < LITTLE_RANGE * white):
-        tell_if_little((width if narrow else high) / white, name)
-    if not narrow:
+    if not 0 < width < min(low, LITTLE_RANGE * white):
         return 0, white
     low, high = max(inner[0], low - width), min(inner[inner <= white][-1], high + width)
     margin = max(0, 255 - (high - low))
     return float(low - margin // 2), float(high + margin - margin // 2)
 
 
-def tell_if_little(used: float, name: str) -> None:
-    """Warn if an image uses a small fraction of its range, but not if it shows nothing."""
+def tell_if_little(values: np.ndarray, white: float, name: str) -> None:
+    """Warn if an image uses a small fraction of its range from 0 to `white`."""
+    step = 1 + math.isqrt(values.size >> 16)  # a grid of some 65,536 values tells enough
+    seen = values[::step, ::step]
+    seen = seen[(seen > 0) & (seen < white)]  # the ends may be padding
+    if len(seen):
+        low, high = np.quantile(seen.astype(np.float64), (MAX_OUTLIERS, 1 - MAX_OUTLIERS))
+        _tell_if_little(float(low), float(high), white, name)
+
+
+def _tell_if_little(low: float, high: float, white: float, name: str) -> None:
+    used = (high - low if high - low < low else high) / white
     if 0 < used < LITTLE_RANGE:
         what = f"{name} uses {used:.1%} of its range: give the range by `value_range`"
         warnings.warn(what, UserWarning, stacklevel=2)

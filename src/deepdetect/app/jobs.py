@@ -20,6 +20,7 @@ from .._shared.errors import DeepDetectError, OptionError
 from .._shared.machine import end_with_parent
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.signals import kill_group, signals_held
+from ..io.image import one_range
 from ..io.image_file import read_with, reading_options
 from .tasks import TASKS, Order
 
@@ -179,7 +180,8 @@ def run_task(sender: Connection, order: Order) -> None:
         sender.send({"state": "running", "stage": stage, "done": done, "total": total})
 
     try:
-        with read_with(reading_options(max_megapixels=order.max_megapixels)):
+        limited = reading_options(max_megapixels=order.max_megapixels)
+        with read_with(limited), one_range([image.path for image in order.images]):
             result = TASKS[order.kind].run(order.images, order.options, results, report)
         sender.send({"state": "done", **vars(result)})
         return

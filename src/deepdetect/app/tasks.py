@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.pictures import draw_all_matches
 from ..io.exif import calibration_from_exif
-from ..io.image import load_image
+from ..io.image import load_pixels
 from ..io.picture_file import save_picture
 from ..io.tables import save_keypoints, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_images
@@ -119,7 +120,7 @@ class Task:
 def run_match(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Match two images, guided by a geometry that is estimated first."""
     stages = _stages(GUIDED_STAGES, report)
-    first, second = (load_image(one.path) for one in images)
+    first, second = (load_pixels(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
     if not matches.success:
         raise DeepDetectError("no geometry can be trusted: both images must show the same scene")
@@ -159,7 +160,7 @@ def run_stitch(images: Images, options: Options, folder: Path, report: Report) -
     """Stitch a panorama."""
     stages = _stages(stages_of(len(images)), report)
     panorama = stitch([one.path for one in images], progress=stages)
-    save_picture(panorama.image, folder / "panorama.jpg")
+    save_picture(panorama.image, folder / "panorama.jpg", value_range=panorama.value_range)
     height, width = panorama.image.shape[:2]
     used = len(images) - len(panorama.unregistered)
     numbers = {
@@ -177,7 +178,7 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
     done = itertools.count(1)
     report("starting", 0, MODEL_STAGES)
     left, right = (one.path for one in images)
-    sizes = [load_image(path).shape[1::-1] for path in (left, right)]
+    sizes = [load_pixels(path).shape[1::-1] for path in (left, right)]
     focal_px, assumed = options.get("focal_px"), False
     if focal_px is None:
         try:
@@ -237,7 +238,7 @@ def run_folder_keypoints(
         for number, one in enumerate(images):
             report(one.name, number, len(images))
             try:
-                rgb = load_image(one.path)
+                rgb = load_pixels(one.path)
             except DeepDetectError as error:
                 failures.append(str(error).replace(str(one.path), one.name))
                 continue
@@ -267,9 +268,8 @@ def _entry_name(name: str, others: Sequence[str]) -> str:
         >>> _entry_name("a/b.jpg", []), _entry_name("../b", ["b.csv"])
         ('b.csv', 'b_2.csv')
     """
-    stem = Path(name.replace("\\", "/")).stem
-    stem = "".join(c if c.isalnum() or c in "-_ " else "_" for c in stem) or "image"
-    names = (f"{stem}{end}.csv" for end in ("", *(f"_{k}" for k in range(2, len(others) + 3))))
+    stem = re.sub(r"[^\w -]", "_", Path(name.replace("\\", "/")).stem) or "image"
+    names = itertools.chain([f"{stem}.csv"], (f"{stem}_{k}.csv" for k in itertools.count(2)))
     return next(name for name in names if name not in others)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from .._shared.errors import noted_failures
+from .._shared.errors import DeepDetectError, noted_failures
 from .._shared.options import suggest_keywords
 from .._shared.records import file_state, key
+from .._shared.value_range import ValueRange
 from ..detector.detector import DeepDetect, check_selection, find_keypoints
 from ..detector.heatmap import HeatmapOptions, seen_size
 from ..detector.point_detector import PointDetector
@@ -26,7 +28,7 @@ from ..features.selection import SelectionOptions
 from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import find_images, load_visible, luma, one_range
 from ..io.image_file import ReadingOptions, read_with, reading_options
-from .hdf5 import SETTINGS, BatchReport, Group, Item, State, damaged, fill_file
+from .hdf5 import SETTINGS, BatchReport, Group, Item, State, damaged, fill_file, open_hdf5
 
 ROOT_SIFT_NORM = 512
 """Euclidean norm of RootSIFT descriptors that are stored as bytes."""
@@ -100,7 +102,8 @@ def extract_features(
     root = Path(folder).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
     utf8 = [name for name in names if name == name.encode("utf-8", "ignore").decode()]
-    limited = reading_options(max_megapixels=max_megapixels)
+    known = None if overwrite else noted_range(path)
+    limited = reading_options(max_megapixels=max_megapixels, deep_range=known)
     with read_with(limited), one_range([root / name for name in utf8]) as reading:
         pass
     settings = {
@@ -135,6 +138,17 @@ def extract_features(
     )
     unnamed = [f"{n}: its name is not UTF-8: rename it" for n in names if n not in utf8]
     return replace(report, failures=(*unnamed, *report.failures))
+
+
+def noted_range(path: str | Path) -> ValueRange | None:
+    """Return the range by which the uint16 images of a file of features were read, if it has one.
+
+    Images that are added later are read by the same range.
+    """
+    with suppress(DeepDetectError, ValueError, TypeError), open_hdf5(Path(path)) as file:
+        low, high = json.loads(file.attrs[SETTINGS])["deep_range"]
+        return low, high
+    return None
 
 
 def _extract(

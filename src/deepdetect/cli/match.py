@@ -28,6 +28,7 @@ from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image, load_pixels, one_range
+from ..io.image_file import reading_options
 from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_picture
 from ..io.projection import require_pinhole
 from ..io.tables import read_matrix, save_matches
@@ -416,11 +417,10 @@ def stitch(
             warnings.warn(named(warning.message), warning.category, stacklevel=2)
         moved = panorama.homographies[panorama.reference] if flat else None
         kept, image = carried[panorama.reference].moved(moved), panorama.image
-        if kept.no_data is not None and kept.no_data in range(np.iinfo(image.dtype).max + 1):
-            image = np.where(panorama.valid[..., None], image, image.dtype.type(kept.no_data))
-        else:
-            kept = replace(kept, no_data=None)
-        save_picture(image, made["file"], kept)
+        if file.suffix.lower() in (".tif", ".tiff"):
+            image = kept.raster(image, reading_options().value_range or (0, 1))
+        image, kept = kept.with_no_data(image, ~panorama.valid)
+        save_picture(image, made["file"], kept, panorama.value_range)
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
         failures.append(f"{images[number]} is not in the panorama: {reason}")

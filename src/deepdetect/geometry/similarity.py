@@ -1,7 +1,7 @@
 """Fit a similarity robustly to points that are known in two frames, to georeference a model.
 
-A least-median-of-squares search finds a similarity on which most points agree. Gauss-Newton with
-Huber's weights then refines it, using all points, and directions that are known to be horizontal.
+A least-median-of-squares search finds a similarity, and Gauss-Newton with Huber's weights refines
+it by all points, and by directions that are known to be horizontal.
 """
 
 from __future__ import annotations
@@ -22,22 +22,16 @@ MAX_SAMPLES = 500
 the same number of pairs. Chosen by hand."""
 
 MAX_START_TILT_DEG = 60.0
-"""A similarity fitted to three points may tilt the known upward direction away from the z axis by
-at most this angle, because three points that lie nearly on a line can give any tilt."""
+"""A similarity of three points may tilt the known upward direction away from the z axis by at most
+this angle, because three points that lie nearly on a line can give any tilt."""
 
-MIN_AREA_POINTS, MIN_AREA = 8, 0.2
-"""The points can overrule the known upward direction only if there are at least MIN_AREA_POINTS,
-and their second principal axis is above MIN_AREA times as long as the first. Chosen by hand."""
+MIN_AREA_POINTS, MIN_AREA, MUCH_BETTER = 8, 0.2, 0.5
+"""Points can overrule the known upward direction only if there are MIN_AREA_POINTS, their second
+principal axis is above MIN_AREA times as long as the first, and the median distance from the
+targets falls below MUCH_BETTER of what it was. Chosen by hand."""
 
-MUCH_BETTER = 0.5
-"""The known upward direction is overruled only if tilting it by more than `MAX_START_TILT_DEG`
-reduces the median distance from the targets to below this fraction. Chosen by hand."""
-
-HUBER_STDS = 2.0
-"""Residuals larger than this number of standard deviations get less weight. Chosen by hand."""
-
-WRONG_STDS = 5.0
-"""A point with a residual above this many standard deviations gets no weight. Chosen by hand."""
+HUBER_STDS, WRONG_STDS = 2.0, 5.0
+"""Residuals above these numbers of standard deviations get less weight, or none. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
 """The stated accuracy of the targets counts as much as this number of residuals, because a few
@@ -71,10 +65,8 @@ class SimilarityFit:
         residuals: (N, 3) targets minus transformed points, NaN where the target is unknown.
         wrong: (N,) bool, True for points that do not agree with the others.
         scale_std: relative standard deviation of the scale; 0 if the scale was given.
-        axes_std_deg: (3,) standard deviations, in degrees, of the rotation about the x, y and z
-            axes of the targets.
-        axis_std_deg_of_targets: standard deviation, in degrees, of the rotation about its least
-            certain axis, as determined without the horizontal directions; at most 180.
+        axes_std_deg: (3,) of the rotation about the x, y and z axes of the targets, in degrees.
+        axis_std_deg_of_targets: that about its least certain axis without `level`; at most 180.
     """
 
     similarity: Similarity
@@ -94,19 +86,17 @@ def fit_similarity(
     level: np.ndarray = np.empty((0, 3)),
     level_stds: np.ndarray = np.empty(0),
     scale: float | None = None,
-    seed: int = 0,
 ) -> SimilarityFit:
     """Fit the similarity from points to targets on which most of the points agree.
 
     Args:
         points: (N, 3) positions of at least three points.
-        targets: (N, 3) target positions of these points, z up; z may be NaN where it is unknown.
+        targets: (N, 3) positions of the same points, z up; z may be NaN where it is unknown.
         accuracy: expected standard deviation of the targets.
         up: (3,) approximate upward direction in the frame of the points.
-        level, level_stds: (L, 3) horizontal directions in the frame of the points, and their (L,)
-            standard deviations in radians.
+        level, level_stds: (L, 3) horizontal directions there, and their (L,) standard deviations
+            in radians.
         scale: the scale, if it is known.
-        seed: seed of the random samples.
 
     Raises:
         ReconstructionError: the points coincide, or too few of them agree.
@@ -115,7 +105,7 @@ def fit_similarity(
     targets = targets.copy()
     known = np.isfinite(targets)
     targets[~known] = 0.0
-    found = _search(points, targets, known, up, scale, seed)
+    found = _search(points, targets, known, up, scale)
     if found is None:
         raise ReconstructionError("the points are in one place")
     middle = points.mean(axis=0)  # rotation and scale about this point keep the translation
@@ -132,11 +122,7 @@ def fit_similarity(
         stds = _spread(residuals[~wrong], known[~wrong], accuracy)
         weights = np.where(wrong, 0, np.minimum(1, HUBER_STDS / np.maximum(away, 1e-12)))
         turned = current.scale * (own @ current.rotation.T)
-        jacobian = np.zeros((len(points), 3, 7))
-        jacobian[:, :, :3] = np.eye(3)
-        jacobian[:, :, 3:6] = [-cross_matrix(row) for row in turned]
-        jacobian[:, :, 6] = turned
-        jacobian *= (known / stds)[:, :, None]
+        jacobian = changes(turned) * (known / stds)[:, :, None]
         weighted = jacobian * weights[:, None, None]
         of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
         right = np.einsum("nai,na->i", weighted, residuals / stds)
@@ -171,22 +157,27 @@ def fit_similarity(
     )
 
 
+def changes(points: np.ndarray) -> np.ndarray:
+    """Return how points (N, 3) change (N, 3, 7) by a shift, a small rotation and a small scale."""
+    moves = np.tile(np.eye(3), (len(points), 1, 1))
+    turns = np.reshape([-cross_matrix(row) for row in points], (-1, 3, 3))
+    return np.concatenate([moves, turns, points[:, :, None]], axis=2)
+
+
 def _search(
     points: np.ndarray,
     targets: np.ndarray,
     known: np.ndarray,
     up: np.ndarray | None,
     scale: float | None,
-    seed: int,
 ) -> Similarity | None:
     """Find the similarity of 3 random points, or of 2 and `up`, with the least median distance."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     best: dict[bool, tuple[float, Similarity | None]] = dict.fromkeys((True, False), (np.inf, None))
     for size in [3] * MAX_SAMPLES + [2] * (0 if up is None else MAX_SAMPLES):
         rows = random.choice(len(points), size, replace=False)
-        found = least_squares_similarity(
-            points[rows], targets[rows], up if size == 2 else None, scale
-        )
+        axis = up if size == 2 else None
+        found = least_squares_similarity(points[rows], targets[rows], axis, scale)
         if found is None:
             continue
         median = float(np.median(np.linalg.norm((targets - found.apply(points)) * known, axis=1)))
@@ -207,8 +198,7 @@ def least_squares_similarity(
 ) -> Similarity | None:
     """Fit a similarity by least squares (Umeyama, 1991); return None if all points coincide.
 
-    If `up` is given, this direction is mapped to the z axis, and only the rotation about the z axis
-    is fitted.
+    If `up` is given, it is mapped to the z axis, and only the rotation about this axis is fitted.
     """
     middle, middle_of_targets = points.mean(axis=0), targets.mean(axis=0)
     own, other = points - middle, targets - middle_of_targets

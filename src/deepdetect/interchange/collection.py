@@ -13,7 +13,7 @@ from .._shared.progress import progress
 from ..batch.pair_list import Pair
 from ..features.keypoints import Keypoints
 from ..features.sift import describe_keypoints
-from ..io.image import UPRIGHT, load_image, luma, orientation_of
+from ..io.image import UPRIGHT, load_image, luma, one_range, orientation_of
 from ..io.image_file import open_image
 
 
@@ -106,12 +106,14 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
         ImageError: the size of an image differs from that of its keypoints.
     """
     described = dict(collection.keypoints)
-    left = [name for name, points in described.items() if points.descriptors is None]
-    left = [name for name in left if collection.path(name) is not None]
-    with progress(len(left), "describing", "image", quiet) as bar:
-        for name in left:
-            points, path = described[name], collection.path(name)
-            gray = luma(load_image(path))
+    left = {
+        name: path
+        for name, points in described.items()
+        if points.descriptors is None and (path := collection.path(name)) is not None
+    }
+    with one_range([*left.values()]), progress(len(left), "describing", "image", quiet) as bar:
+        for name, path in left.items():
+            points, gray = described[name], luma(load_image(path))
             if gray.shape[::-1] != points.image_size:
                 raise ImageError(
                     f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels, but its keypoints are of "

@@ -32,7 +32,7 @@ class GpsFix:
         accuracy_m: horizontal standard deviation in metres as the camera states it, or None.
         gravity: (3,) unit vector towards the ground in the camera's frame (x right, y down, z
             forward), computed from the gimbal's angles, or None.
-        reference: what `altitude` is measured from: `SEA_LEVEL`, or with RTK `ELLIPSOID`.
+        reference: what `altitude` is measured from: `SEA_LEVEL`, or `ELLIPSOID` (RTK, EXIF 3.0).
         above_take_off: metres above the place where a drone took off; NaN if unknown.
         assumed_hemisphere: whether north or east are assumed, because nothing states them.
     """
@@ -56,6 +56,7 @@ def read_gps(path: Path) -> GpsFix | None:
         with open_image(path) as image:
             exif, xmp = image.getexif(), image.info.get("xmp") or b""
             tags = dict(exif.get_ifd(IFD.GPSInfo))
+            version = _number(exif.get_ifd(IFD.Exif).get(Base.ExifVersion))
         orientation = exif.get(Base.Orientation, 1)
     except Exception:  # Pillow raises many types of errors; broken tags are ignored
         return None
@@ -66,16 +67,18 @@ def read_gps(path: Path) -> GpsFix | None:
     latitude = _degrees(tags.get(GPS.GPSLatitude), north_south == "S")
     longitude = _degrees(tags.get(GPS.GPSLongitude), east_west == "W")
     assumed = north_south not in ("N", "S") or east_west not in ("E", "W")
-    # EXIF 3.0 adds 2 and 3 for heights above and below sea level.
-    below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01", 3, b"\x03")
-    altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if below_sea else 1)
+    # 0 and 1 are above and below sea level, or since EXIF 3.0 the ellipsoid; then 2 and 3 are new.
+    reference = tags.get(GPS.GPSAltitudeRef, 0)
+    reference = reference[0] if isinstance(reference, bytes) else reference
+    altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if reference in (1, 3) else 1)
     # Older drones write "Longtitude".
     east = drone.get("GpsLongitude", drone.get("GpsLongtitude", np.nan))
     north, absolute = (drone.get(name, np.nan) for name in ("GpsLatitude", "AbsoluteAltitude"))
     if np.isfinite(east + north) and (north or east):
         latitude, longitude, assumed = north, east, False
-    altitude = absolute if np.isfinite(absolute) else altitude
-    rtk = np.isfinite(absolute) and drone.get("RtkFlag", 0) > 0
+    ellipsoidal = version >= 300 and reference in (0, 1)
+    if np.isfinite(absolute):
+        altitude, ellipsoidal = absolute, drone.get("RtkFlag", 0) > 0
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
         return None
     spread = np.hypot(drone.get("RtkStdLat", np.nan), drone.get("RtkStdLon", np.nan))
@@ -86,7 +89,7 @@ def read_gps(path: Path) -> GpsFix | None:
         altitude,
         accuracy if accuracy > 0 else None,
         _gravity(drone) if orientation == 1 else None,
-        ELLIPSOID if rtk else SEA_LEVEL,
+        ELLIPSOID if ellipsoidal else SEA_LEVEL,
         drone.get("RelativeAltitude", np.nan),
         assumed,
     )
@@ -94,7 +97,7 @@ def read_gps(path: Path) -> GpsFix | None:
 
 def _gravity(drone: dict[str, float]) -> np.ndarray | None:
     """Compute `GpsFix.gravity` from roll and pitch of the gimbal in degrees; pitch -90 is down."""
-    angles = drone.get("GimbalPitchDegree", np.nan), drone.get("GimbalRollDegree", np.nan)
+    angles = [drone.get(f"Gimbal{name}Degree", np.nan) for name in ("Pitch", "Roll")]
     if not max(map(abs, angles)) <= MAX_GRAVITY_TILT_DEG:
         return None
     pitch, roll = np.radians(angles)
@@ -103,10 +106,7 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 def _degrees(value: Any, below: bool) -> float:
     """Convert degrees, minutes, seconds to degrees: < 0 if `below` zero, NaN if invalid."""
-    try:
-        degrees, minutes, seconds = (_number(part) for part in value)
-    except (TypeError, ValueError):
-        return np.nan
+    degrees, minutes, seconds = [*map(_number, np.ravel(value)), 0.0, 0.0][:3]
     sum_ = degrees + minutes / 60 + (seconds if np.isfinite(seconds) else 0) / 3600
     return -sum_ if below else sum_
 

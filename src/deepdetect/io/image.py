@@ -21,13 +21,14 @@ from .._shared.image_array import Channels, array_to_pixels, check_channels, dee
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import was_made
-from .._shared.value_range import find_range, range_of_call
+from .._shared.value_range import find_range
 from ..features.selection import check_ignore
 from .companions import holds_image, tell_left_out, without_masks
 from .image_file import (
     IMAGE_SUFFIXES,
     PNG_SIGNATURE,
     RAW_SUFFIXES,
+    SIGNATURE_BYTES,
     ReadingOptions,
     damaged_image,
     file_name,
@@ -53,9 +54,8 @@ twice the time. Chosen by hand."""
 ALL_VALUES = (0, 65535)
 
 ORIENTATION_TAG = 0x0112
-HEADER_BYTES = 26
-"""A PNG file states its bit depth and colour type (`GREY_PNG`: grey) in this many first bytes."""
 GREY_PNG = 0
+"""This byte of a PNG file means that it is grey."""
 
 STRIP_PIXELS = 1 << 20
 """PIL images are converted in strips of this size, since copies of a large image take gigabytes."""
@@ -174,20 +174,20 @@ def load_pair(
 def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOptions]:
     """Read the uint16 images of a call with one range in the block; yield the options of reading.
 
-    The range is that of all images together, or of `SEEN_IMAGES` of a longer list at equal steps,
-    if the first may be of this kind. Open files and pipes, which may be readable once, are not.
+    All functions that read several images, also by way of others, do so in this block. The range is
+    that of all images together, or of `SEEN_IMAGES` of a longer list at equal steps, if the first
+    that may be of this kind is. Open files and pipes, which may be readable once, are not seen.
     """
     options, counts = reading_options(), np.zeros(1 << 16, np.int64)
-    seen = images[:: -(-len(images) // SEEN_IMAGES) or 1] if options.deep_range is None else ()
-    for image in seen:
-        with suppress(Exception), range_of_call(counts), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if _may_be_deep(image):
-                _load(image, channels, options)
+    seen = [each for each in images if _may_be_deep(each)] if options.deep_range is None else []
+    for image in seen[:: -(-len(seen) // SEEN_IMAGES) or 1]:
+        with suppress(Exception), warnings.catch_warnings(action="ignore"):
+            _load(image, channels, replace(options, counts=counts))
         if not counts.any():
             break
     if counts.any():
-        options = replace(options, deep_range=find_range(counts, file_name(images[0])))
+        found = options.value_range or find_range(counts, file_name(seen[0]))
+        options = replace(options, deep_range=found)
     with read_with(options):
         yield options
 
@@ -195,12 +195,22 @@ def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOption
 def _may_be_deep(image: Any) -> bool:
     """Return whether an image may have 16 bits per channel, by the first bytes of a file."""
     if is_path(image) and Path(image).is_file():
-        with open(image, "rb") as file:
-            image = file.read(HEADER_BYTES)
+        with suppress(OSError), open(image, "rb") as file:
+            image = file.read(SIGNATURE_BYTES)
     if isinstance(image, (bytes, bytearray)):
-        png = image[:4] == PNG_SIGNATURE[:4] and image[24] == 16
-        return png or image[:4] in TIFF_STARTS or image[4:6] == b"jP"  # JPEG 2000
+        return image[:4] in TIFF_STARTS or _stated_bits(image) > 8
     return not is_file(image) and getattr(image, "dtype", None) != np.uint8
+
+
+def _stated_bits(start: bytes | bytearray) -> int:
+    """Return the bits per channel that the beginning of a PNG or JPEG 2000 file states, or 0."""
+    header = start.find(b"ihdr")  # ISO/IEC 15444-1, I.5.3.1, and A.5.1 for a bare codestream
+    if start[:4] == PNG_SIGNATURE[:4]:
+        return int.from_bytes(start[24:25])
+    if start[:4] == b"\xffO\xffQ" or header > 0:
+        bits = 1 + int.from_bytes(start[42:43] if header < 0 else start[header + 14 : header + 15])
+        return bits if bits <= 16 else 0  # signed or of several depths
+    return 0
 
 
 def _load(
@@ -217,11 +227,12 @@ def _load(
     elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
         if for_arrays.get("bands") is not None:
             raise OptionError("`bands` need a TIFF file or an array: leave them out")
-        rgb = _from_pil(image, "the image", for_arrays.get("value_range"), deep, raw)
+        options = replace(options, value_range=for_arrays.get("value_range"))
+        rgb = _from_pil(image, "the image", options, deep, raw)
     elif raw and isinstance(image, np.ndarray) and image.ndim in (2, 3):
         rgb = image.reshape(*image.shape[:2], -1)
     else:
-        rgb = array_to_pixels(image, channels, deep=deep, **for_arrays)
+        rgb = array_to_pixels(image, channels, deep=deep, **options.common, **for_arrays)
     height, width = rgb.shape[:2]
     if min(height, width) < MINIMUM_SIDE:
         raise ImageError(
@@ -281,18 +292,6 @@ def ignore_masks(ignore: Any, images: int) -> list[Any]:
 def luma(rgb: np.ndarray) -> np.ndarray:
     """Return the 8-bit luma (ITU-R BT.601) of a uint8 image of 3 or 4 channels, (H, W) uint8."""
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY if rgb.shape[2] == 3 else cv2.COLOR_RGBA2GRAY)
-
-
-def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
-    """Scale an image so that its shorter side has the given length in pixels."""
-    height, width = rgb.shape[:2]
-    factor = short_side / min(height, width)
-    if factor == 1:
-        return rgb
-    size = (max(round(width * factor), short_side), max(round(height * factor), short_side))
-    # Area averaging does not alias when shrinking; cubic keeps edges when enlarging.
-    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
-    return cv2.resize(rgb, size, interpolation=method)
 
 
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
@@ -356,17 +355,17 @@ def _read_file(
     source: Any, options: ReadingOptions, deep: bool = False, raw: bool = False
 ) -> np.ndarray:
     with open_file(source) as (file, name):
-        start, several = file.read(HEADER_BYTES), True
+        start, several = file.read(SIGNATURE_BYTES), True
         if start[:4] in TIFF_STARTS and not name.lower().endswith(RAW_SUFFIXES):
             rgb, orientation = read_tiff(file, name, options, deep, raw)
         elif options.bands is not None and not raw:
             raise OptionError(f"`bands` need a TIFF file or an array: leave them out for {name}")
         else:
             with open_image(file, options=options) as image:
-                if image.format == "PNG" and start[24] == 16 and start[25] != GREY_PNG:
-                    rgb = _deep_png(file, name, options, deep, raw)
+                if _stated_bits(start) > 8 and (start[25] != GREY_PNG or image.format != "PNG"):
+                    rgb = _by_opencv(file, name, options, deep, raw)
                 else:
-                    rgb = _from_pil(image, name, options.value_range, deep, raw)
+                    rgb = _from_pil(image, name, options, deep, raw)
                 orientation, several = orientation_of(image), hasattr(image, "n_frames")
             del image  # frees its pixels before `UPRIGHT` makes another copy
         pages: list[int] = []
@@ -388,16 +387,17 @@ def _behind_mask(rgb: np.ndarray, name: str) -> np.ndarray:
     return on_grey(rgb, shown, 1, name) if shown.shape == rgb.shape[:2] else rgb
 
 
-def _deep_png(
+def _by_opencv(
     file: BinaryIO, name: str, options: ReadingOptions, deep: bool, raw: bool
 ) -> np.ndarray:
-    """Read a PNG file with several channels of 16 bits, which Pillow would reduce to 8."""
+    """Read a PNG or JPEG 2000 file with 9 to 16 bits, which Pillow would reduce or scale."""
     file.seek(0)
     values = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise damaged_image(name, "it cannot be decoded")
     value_range = ALL_VALUES if raw else options.value_range
-    return array_to_pixels(values, "bgr", name, value_range=value_range, deep=deep)
+    common = options.common
+    return array_to_pixels(values, "bgr", name, value_range=value_range, deep=deep, **common)
 
 
 def orientation_of(image: Any) -> Any:
@@ -408,13 +408,8 @@ def orientation_of(image: Any) -> Any:
         return 1
 
 
-def _from_pil(
-    image: Any,
-    name: str,
-    value_range: tuple[float, float] | None = None,
-    deep: bool = False,
-    raw: bool = False,
-) -> np.ndarray:
+def _from_pil(image: Any, name: str, options: ReadingOptions, deep: bool, raw: bool) -> np.ndarray:
+    value_range = options.value_range
     try:
         image.load()
     except Exception as error:  # Pillow's decoders raise many kinds of errors
@@ -424,7 +419,8 @@ def _from_pil(
         white = 65535 if image.format == "PPM" else None  # Pillow scales white to this in PPM
         if raw and values.dtype == np.uint16:
             value_range = ALL_VALUES
-        rgb = array_to_pixels(values, name=name, value_range=value_range, white=white, deep=deep)
+        how = {"value_range": value_range, "white": white, "deep": deep, **options.common}
+        rgb = array_to_pixels(values, name=name, **how)
         clear = image.info.get("transparency")
         return rgb if clear is None else on_grey(rgb, values != clear, 1, name)
     width, height = image.size

@@ -31,7 +31,7 @@ from .._shared.errors import (
     first_line,
 )
 from .._shared.options import shown, suggest_keywords, whole
-from .._shared.value_range import range_of_call
+from .._shared.value_range import ValueRange
 
 FORMATS = {
     "JPEG": ".jpg .jpeg .jpe .jfif .jfi .jif .mpo .jps .insp",
@@ -101,37 +101,41 @@ YUV4MPEG, MP4 and MOV, and of MPEG transport streams, whose packets have 188 or 
 @suggest_keywords
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How image files are read; the fields other than the last are parameters of `load_image`.
+    """How image files are read; the fields other than the last two are parameters of `load_image`.
 
     `deep_range` is the range of uint16 images that state none, common to the images of a call.
+    While it is looked for, the values of these images are added up in `counts`.
     """
 
     max_megapixels: float = MAX_MEGAPIXELS
-    value_range: tuple[float, float] | None = None
+    value_range: ValueRange | None = None
     bands: tuple[int, int, int] | None = None
     page: int | None = None
     allow_truncated: bool = False
-    deep_range: tuple[float, float] | None = None
+    deep_range: ValueRange | None = None
+    counts: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not (isinstance(self.max_megapixels, Real) and self.max_megapixels > 0):
             raise OptionError(f"`max_megapixels` must be above 0, not {self.max_megapixels}")
         if self.page is not None:
             whole("page", self.page)
-        for name, count in (("bands", 3), ("value_range", 2)):
+        for name, count, kind, what in (
+            ("bands", 3, Integral, "3 numbers from 1 on"),
+            ("value_range", 2, Real, "2 numbers, black and a larger white"),
+        ):
             value = getattr(self, name)
             numbers: tuple[Any, ...] = tuple(value) if np.iterable(value) else ()
-            fits = len(numbers) == count and all(isinstance(each, Real) for each in numbers)
-            if fits and name == "bands":
-                fits = all(isinstance(each, Integral) and each > 0 for each in numbers)
-            elif fits:
-                fits = bool(0 < numbers[1] - numbers[0] < math.inf)
-            if not (fits or value is None):
-                what = (
-                    "3 numbers from 1 on" if count == 3 else "2 numbers, black and a larger white"
-                )
+            fits = len(numbers) == count and all(isinstance(each, kind) for each in numbers)
+            least = numbers[1] - numbers[0] if fits and count == 2 else min(numbers, default=0)
+            if value is not None and not (fits and 0 < least < math.inf):
                 raise OptionError(f"`{name}` must be {what}, not {shown(value)}")
             object.__setattr__(self, name, numbers or None)
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What `array_to_pixels` needs to know about the other images of the call."""
+        return {"call": self.deep_range, "counts": self.counts}
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -161,8 +165,7 @@ def read_with(options: ReadingOptions) -> Iterator[None]:
     """
     token = _reading.set(options)
     try:
-        with range_of_call(options.deep_range):
-            yield
+        yield
     finally:
         _reading.reset(token)
 

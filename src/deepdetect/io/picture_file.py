@@ -5,6 +5,7 @@ The georeference is that of a GeoTIFF or a world file, read by rasterio.
 
 from __future__ import annotations
 
+import re
 import struct
 import warnings
 from collections.abc import Iterator
@@ -21,12 +22,17 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError, require_packages
 from .._shared.image_array import to_8_bits
 from .._shared.opencv import cv2
+from .._shared.value_range import ValueRange
 from .image import UPRIGHT
 from .image_file import open_file, open_image, reading_options
 from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
 """Tags of GeoTIFF for pixel scale and transformation. A georeferenced TIFF has one of them."""
+
+PLACES = re.compile(rb"<GeoTransform>|<GeodataXform|<GCPList|gml\.data|\xb1\x4b\xf8\xbd\x08\x3d")
+MAX_HEADER_BYTES = 1 << 20
+"""Marks of places in .aux.xml and at the start of JPEG 2000 files, and the bytes to search."""
 
 NO_MATRIX = "the place of an image is not kept, since no affine matrix that GDAL reads states it: \
 warp an image with ground control points or RPCs by gdalwarp first"
@@ -58,6 +64,10 @@ EXIF_TEXTS = (
 EXIF_DIRECTORIES = (IFD.Exif, IFD.GPSInfo)
 """EXIF tags and directories that are kept, since they do not depend on how pixels are stored."""
 
+LAYOUT = re.compile(r"\s*[{<]|ImageJ=|SCANIMAGE|Aperio")
+"""Descriptions in TIFF files that begin so state the layout of their pages: those of tifffile, OME,
+ImageJ, ScanImage and Aperio. They would be wrong for another image."""
+
 
 @dataclass(frozen=True, eq=False)
 class Metadata:
@@ -70,7 +80,8 @@ class Metadata:
         no_data: value that means "no data" according to GDAL's tag, or None.
         profile: the ICC profile, or None.
         exif: the EXIF as an object of Pillow, or None.
-        plain: whether pixels are grey, RGB or RGB with alpha, of at most 16 bits per value.
+        bands: number of bands, alpha included.
+        dtype: data type of a value.
     """
 
     to_world: np.ndarray | None = None
@@ -78,7 +89,34 @@ class Metadata:
     no_data: float | None = None
     profile: bytes | None = None
     exif: Any = None
-    plain: bool = True
+    bands: int = 3
+    dtype: Any = np.uint8
+
+    @property
+    def plain(self) -> bool:
+        """Whether pixels are grey, RGB or RGB with alpha, of at most 16 bits per value."""
+        return self.bands in (1, 3, 4) and np.dtype(self.dtype) in (np.uint8, np.uint16, np.bool_)
+
+    def raster(self, rgb: np.ndarray, value_range: ValueRange) -> np.ndarray:
+        """Return uint16 RGB with the type and the numbers of this image, grey if it is grey.
+
+        The range are the numbers that 0 and 65535 stand for, unless the image is uint16 itself.
+        """
+        if self.bands == 1 and (rgb == rgb[:, :, :1]).all():
+            rgb = rgb[:, :, 0]
+        if self.plain or rgb.dtype != np.uint16:
+            return rgb
+        numbers = value_range[0] + rgb * ((value_range[1] - value_range[0]) / 65535)
+        return (numbers if self.dtype.kind == "f" else np.rint(numbers)).astype(self.dtype)
+
+    def with_no_data(self, image: np.ndarray, absent: np.ndarray) -> tuple[np.ndarray, Metadata]:
+        """Give absent pixels the value that means "no data", if the image's type has that value."""
+        value, whole = self.no_data, np.iinfo(image.dtype) if image.dtype.kind in "iu" else None
+        if value is None or not (whole is None or whole.min <= value <= whole.max):
+            return image, replace(self, no_data=None)
+        filled = image.copy()
+        filled[absent] = value
+        return filled, self
 
     def moved(self, matrix: np.ndarray | None) -> Metadata:
         """Return the metadata after a warp by an affine (3, 3) matrix; None: an unknown warp."""
@@ -237,6 +275,9 @@ def _read_place(path: Path, page: Any, orientation: int) -> dict[str, Any]:
     beside = {each.suffix.lower(): each for each in files if each.stem.lower() == stem}
     tagged = page is not None and {PIXEL_SCALE, TRANSFORMATION} & {*page.tags.keys()}
     stated = bool(tagged or beside.keys() & {*_world_endings(path)})
+    for each in (path, path.with_name(f"{path.name}.aux.xml")):
+        with suppress(OSError), each.open("rb") as file:
+            stated |= PLACES.search(file.read(MAX_HEADER_BYTES)) is not None
     if stated:
         require_packages(f"the georeference of {path}", "rasterio")
     name = str(path.absolute())  # GDAL may read `a:b` as DRIVER:FILE
@@ -290,6 +331,8 @@ def _kept_exif(exif: Any) -> Any:
     """Return the EXIF tags of a TIFF file except those on how pixels are stored."""
     kept = Image.Exif()
     kept.update({code: exif[code] for code in EXIF_TEXTS if code in exif})
+    if LAYOUT.match(str(kept.get(Base.ImageDescription, ""))):
+        del kept[Base.ImageDescription]
     for code in set(EXIF_DIRECTORIES).intersection(exif):
         kept.get_ifd(code).update(exif.get_ifd(code))
         kept[code] = 0  # placeholder; writing sets the pointer
@@ -304,13 +347,21 @@ def _of_tiff(file: Any) -> tuple[Metadata, Any]:
     with TiffFile(file, name="image.tif") as tiff:
         page = chosen_page([*tiff.pages], "the image", reading_options())
         profile = page.tags.valueof(ICC_PROFILE)
-    plain = page.samplesperpixel in (1, 3, 4) and str(page.dtype) in ("uint8", "uint16", "bool")
     profile = None if profile is None else bytes(profile)
-    return Metadata(no_data=no_data_of(page), profile=profile, plain=plain), page
+    kind = {"bands": page.samplesperpixel, "dtype": page.dtype}
+    return Metadata(no_data=no_data_of(page), profile=profile, **kind), page
 
 
-def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
-    """Write (H, W, 3) uint8 or uint16 RGB with its metadata as .png, .tif or .jpg, atomically."""
+def save_picture(
+    rgb: np.ndarray,
+    path: str | Path,
+    metadata: Metadata = Metadata(),
+    value_range: ValueRange = (0, 65535),
+) -> None:
+    """Write (H, W, 3) uint8 or uint16 RGB with its metadata as .png, .tif or .jpg, atomically.
+
+    JPEG files get 8 bits; the range are the values of black and white of uint16 pixels.
+    """
     suffix = picture_suffix(path)
     if suffix.startswith(".tif"):
         metadata.write_tiff(rgb, Path(path))
@@ -323,7 +374,7 @@ def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadat
         )
     settings = []
     if suffix != ".png":
-        rgb, settings = to_8_bits(rgb), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        rgb, settings = to_8_bits(rgb, value_range), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     data = metadata.encode(rgb, suffix, settings)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)

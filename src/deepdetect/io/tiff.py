@@ -8,6 +8,8 @@ from __future__ import annotations
 import io
 import logging
 import os
+from contextlib import suppress
+from itertools import takewhile
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -72,22 +74,23 @@ def read_tiff(
             file.seek(0)
             filled = io.BytesIO(file.read() + bytes(last - size))
             return read_tiff(filled, name, options, deep, raw)
+        orientation = int(page.tags.valueof(ORIENTATION, 1))
         try:
             array = page.asarray(squeeze=False)
         except Exception as error:  # tifffile and its decoders raise many types of errors
-            if "imagecodecs" not in str(error):
+            if "imagecodecs" not in str(error) and not isinstance(error, ImportError):
                 raise damaged_image(name, error) from None
-            return _read_by_pillow(file, stored, page, name, options), 1
-        # tifffile's axes are bands stored as planes, depth, height, width, bands stored per pixel.
-        # One of the two axes for bands has length 1. The result is (height, width, bands).
-        bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
-        orientation = int(page.tags.valueof(ORIENTATION, 1))
+            bands, orientation = _decoded_by_pillow(file, stored, page, name), 1
+        else:
+            # tifffile's axes are bands stored as planes, depth, height, width, bands stored per
+            # pixel. One of the two axes for bands has length 1. The result is (H, W, bands).
+            bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
         if raw and photometric in (MIN_IS_BLACK, RGB):
             return bands, orientation
         pixels = _to_pixels(bands, page, name, options, deep)
-        masks = [each for each in stored if each.is_mask and each.shape[:2] == page.shape[:2]]
-        if masks and photometric != PALETTE and pixels.shape[2] == 3:
-            pixels = on_grey(pixels, masks[0].asarray() != 0, 1, name)
+        mask = _mask_of(stored, page)
+        if mask is not None and pixels.shape[2] == 3 and mask.shape == pixels.shape[:2]:
+            pixels = on_grey(pixels, mask, 1, name)
         return pixels, orientation
 
 
@@ -106,6 +109,16 @@ def whole_pages(stored: list[Any]) -> list[Any]:
     pages = [page for page in stored if not (page.is_reduced or page.is_mask)]
     below = [each for page in stored for each in page.pages or ()] if not pages else []
     return pages or [each for each in below if not (each.is_reduced or each.is_mask)] or stored[:1]
+
+
+def _mask_of(stored: list[Any], page: Any) -> np.ndarray | None:
+    """Return GDAL's mask of a page, (H, W) bool: it follows the page, as its thumbnails do."""
+    after = stored[stored.index(page) + 1 :] if page in stored else []
+    others = takewhile(lambda each: each.is_mask or each.is_reduced, after)
+    size = page.imagewidth, page.imagelength
+    masks = (each for each in others if each.is_mask)
+    found = next((each for each in masks if (each.imagewidth, each.imagelength) == size), None)
+    return None if found is None else np.asarray(found.asarray() != 0)
 
 
 def page_numbers(source: Any) -> list[int]:
@@ -155,9 +168,11 @@ def _to_pixels(
     photometric = int(page.photometric)
     chosen = _chosen_bands(bands, page, name, options)
     value = no_data_of(page)
-    absent = np.isnan(chosen) | (chosen == (np.nan if value is None else value))
-    if absent.any():
-        chosen = np.where(absent, chosen.dtype.type(0), chosen)
+    each = np.isnan(chosen) | (chosen == (np.nan if value is None else value))
+    absent = each.all(axis=2)  # as GDAL sees it: 0 in one of three bands is a colour
+    empty = each if chosen.dtype.kind == "f" else absent[..., None]
+    if empty.any():
+        chosen = np.where(empty, chosen.dtype.type(0), chosen)
     if photometric == PALETTE:
         colours = page.colormap if page.colormap.max() < 256 else page.colormap >> 8
         rgb = colours.T.astype(np.uint8)[chosen[:, :, 0].astype(np.intp)]
@@ -166,12 +181,11 @@ def _to_pixels(
 
         rgb = np.array(Image.fromarray(np.ascontiguousarray(chosen), "CMYK").convert("RGB"))
     else:
-        rgb = array_to_pixels(
-            chosen, name=name, value_range=options.value_range, white=_white(page), deep=deep
-        )
+        how = {"white": _white(page), "deep": deep, **options.common}
+        rgb = array_to_pixels(chosen, name=name, value_range=options.value_range, **how)
     if photometric == MIN_IS_WHITE:
         rgb = ~rgb
-    alpha, opaque = ~absent.any(axis=2), 1
+    alpha, opaque = ~absent, 1
     extra = [each in ALPHA for each in page.extrasamples]
     if any(extra):  # the extra samples are the last ones
         alpha = np.where(alpha, bands[:, :, extra.index(True) - len(extra)], 0)
@@ -214,26 +228,28 @@ def _white(page: Any) -> int | None:
     return largest if largest > 255 and not largest & (largest + 1) else None
 
 
-def _read_by_pillow(
-    file: BinaryIO, stored: list[Any], page: Any, name: str, options: ReadingOptions
-) -> np.ndarray:
-    """Decode with Pillow, if it does so correctly, a page for which tifffile needs imagecodecs."""
+def _decoded_by_pillow(file: BinaryIO, stored: list[Any], page: Any, name: str) -> np.ndarray:
+    """Decode with Pillow, if it does so correctly, a page for which tifffile needs imagecodecs.
+
+    Returns:
+        (H, W, bands) as they are stored, but turned upright.
+    """
     bits, photometric = page.bitspersample, int(page.photometric)
-    plain = page.dtype.kind in ("b", "u") and (
-        bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)
+    grey = photometric == MIN_IS_BLACK and page.samplesperpixel == 1
+    plain = page.dtype.kind in "bu" and (bits in (1, 8) or (bits == 16 and grey))
+    if plain and page in stored:
+        with suppress(ImageError, OSError), identify(file, name) as image:
+            image.seek(stored.index(page))
+            values = np.asarray(image.convert("RGB") if image.mode == "YCbCr" else image)
+            values = values.reshape(*values.shape[:2], -1)
+            if photometric == MIN_IS_WHITE:
+                values = ~values
+            if ALPHA[0] in page.extrasamples:  # Pillow has divided the colours by alpha
+                colours = np.rint(values[:, :, :-1] * (values[:, :, -1:] / 255))
+                values = np.dstack([colours.astype(np.uint8), values[:, :, -1]])
+            if values.shape[2] == page.samplesperpixel:
+                return values
+    raise MissingExtraError(
+        f"{name} has {page.compression.name} compression with {bits} bits per value: run pip "
+        "install imagecodecs to read it"
     )
-    plain &= not (bits == 16 and photometric != MIN_IS_BLACK) and page.samplesperpixel <= 4
-    plain &= options.bands is None and page.tags.get(NO_DATA) is None
-    if not plain or page not in stored:
-        raise MissingExtraError(
-            f"{name} has {page.compression.name} compression with {bits} bits per value: run pip "
-            "install imagecodecs to read it"
-        )
-    with identify(file, name) as image:
-        image.seek(stored.index(page))
-        image.load()
-        if bits == 16:
-            return array_to_pixels(np.asarray(image), name=name, value_range=options.value_range)
-        rgb = np.asarray(image.convert("RGB"))
-        alpha = "A" in image.getbands()
-        return on_grey(rgb, np.asarray(image.getchannel("A")), 255, name) if alpha else rgb

@@ -19,7 +19,8 @@ from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_st
 from ..matching.guided import TentativeMatches, find_tentative_matches
 
 MAX_ROW_DISTANCE_PX = 1.0
-"""A match of a rectified pair may lie at most this far from its row. Chosen by hand."""
+"""A match of a rectified pair may lie at most this far from its row, and the values of cy of its
+views may differ by twice as much. Chosen by hand."""
 
 MIN_INLIER_RATIO = 0.9
 """A pair is rectified only if its matches on the same row number at least this fraction of the
@@ -54,10 +55,6 @@ MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
 """The focal lengths of rectified views may differ by at most this fraction, so that values rounded
 to three digits pass. If they differ by this much, a row 200 px from the middle is off by 2 px."""
 
-MAX_CY_DIFFERENCE_PX = 2.0
-"""The values of cy of two rectified views may differ by at most this, which is twice the distance
-that a match may lie from its row."""
-
 MIN_DEPTH_SPREAD_PX = 0.5
 """A pair shows depth only if its disparities spread by at least this from the 5th to the 95th
 percentile. Chosen by hand."""
@@ -78,10 +75,6 @@ MAX_RATIO_TO_PLANE = 0.5
 """A pair is rejected as a pure rotation only if the median error of the disparities under the best
 rotation, divided by that under the best plane, is below this. The ratio was up to 0.33 for rotated
 views, and at least 5.3 for slanted walls."""
-
-MAX_OFF_ROW_PX = 1.0
-"""A rotation cannot explain disparities, which come from matches on the same row, if it moves
-points off their rows by a median distance above this."""
 
 ROBUST_ITERATIONS = 12
 
@@ -280,7 +273,7 @@ def check_cameras(calibration: Calibration) -> None:
         ("the focal lengths", focal0, focal1, MAX_FOCAL_DIFFERENCE_FRACTION * focal0)
         for focal0, focal1 in zip(camera0.focal_px, camera1.focal_px, strict=True)
     ]
-    pairs.append(("cy", camera0.centre[1], camera1.centre[1], MAX_CY_DIFFERENCE_PX))
+    pairs.append(("cy", camera0.centre[1], camera1.centre[1], 2 * MAX_ROW_DISTANCE_PX))
     for name, value0, value1, most in pairs:
         if abs(value1 - value0) > most:
             raise ReconstructionError(
@@ -362,7 +355,7 @@ def _rotation_errors(
         angles = _robust_step(slopes, wanted - x, camera.focal_px[0])
         rotation = cv2.Rodrigues(np.array([0, *angles]))[0] @ rotation
     across, down = np.abs(camera.project(rays @ rotation.T) - matched).T
-    return across if np.median(down) <= MAX_OFF_ROW_PX else np.full(len(pixels), np.inf)
+    return across if np.median(down) <= MAX_ROW_DISTANCE_PX else np.full(len(pixels), np.inf)
 
 
 def _plane_errors(pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:

@@ -45,22 +45,23 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
     """Read a file of ground control points in the format of OpenDroneMap.
 
     The first line names the coordinate system, such as "EPSG:32633", "EPSG:2249+6360" or "WGS84 UTM
-    33N". Each other line is `x y z column row image [name]`: a point's coordinates, its pixel in an
-    image, the name of the image, and perhaps that of the point, separated by blanks, tabs, commas
-    or semicolons. A header may state another order. The system also gives the unit of heights: that
-    of its vertical axis, else that of x and y, or metres if these are degrees.
+    33N". Each other line is `x y z column row image [name]`: a point's coordinates, x to the east,
+    and its pixel in an image, separated by blanks, tabs, commas or semicolons. A header may state
+    another order. Heights have the unit of the system's vertical axis, else of x and y, or metres
+    if these are degrees.
     """
     require_packages("a file of ground control points", "pyproj")
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
         return _parsed(line.strip() for line in lines if line.strip())
-    except OSError as error:
-        raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
+    except (OSError, UnicodeError) as error:
+        why = f"({first_line(error)}): check the path, and save it as text in UTF-8"
+        raise OptionError(f"{path} cannot be read {why}") from None
     except Exception as error:  # an error of pyproj, or text in place of numbers
         raise OptionError(
             f"{path} is not a file of ground control points ({first_line(error)}): the first line "
             "must be the coordinate system, such as EPSG:32633, and each other line 'x y z column "
-            "row image', unless a header states another order"
+            "row image' with x to the east, unless a header states another order"
         ) from None
 
 
@@ -77,7 +78,7 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
         elif system and line[0] != "#":
             rows.append(_in_order(words, order))
         elif line[0] != "#":
-            system = line.strip("'\"")
+            system = line.rstrip(",;").strip("'\"")
     if zone := re.fullmatch(r"WGS84 UTM (\d+)([NS]?)", system.upper()):
         system = f"EPSG:{(32700 if zone[2] == 'S' else 32600) + int(zone[1])}"
     crs = CRS.from_user_input(system)
@@ -92,7 +93,7 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
     # Zones are used beyond their borders, so the place may be as far off as the area is large.
     if area := crs.area_of_use:
         width = (area.east - area.west) % 360 or 360
-        aside = (np.median(longitude) - area.west + width) % 360
+        aside = np.median((longitude - area.west + width) % 360)
         above = abs(2 * np.median(latitude) - area.north - area.south)
         if aside > 3 * width or above > 3 * (area.north - area.south):
             text = f"the ground control points are far from where {crs.name} is used: check the "
@@ -124,5 +125,7 @@ def _in_order(words: list[str], order: list[str]) -> list[str]:
     ends = (k for k in range(at, len(words)) if words[k].lower().endswith(IMAGE_SUFFIXES))
     end = next(ends, at) + 1
     words = [*words[:at], " ".join(words[at:end]), *words[end:]]
+    if len(words) < last:
+        raise ValueError(f"a line has fewer than {last} columns")
     fields = dict(zip(order, [*words[:last], " ".join(words[last:])], strict=True))
     return [fields.get(column, "") for column in COLUMNS]

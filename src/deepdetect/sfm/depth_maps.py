@@ -20,6 +20,7 @@ from .._shared.opencv import cv2
 from .._shared.records import file_state
 from ..geometry.camera import Camera, PosedView, angles_between
 from ..io.image import load_image, luma
+from ..io.image_file import ReadingOptions, reading_options
 from ..matching.stereo.sgm import LANES, OUTSIDE_COST, WRONG_PLACE_BITS, aggregate, census
 from .colmap import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel
@@ -373,12 +374,17 @@ def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> floa
 def prepared_image(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView]:
     """Return an undistorted image, whose longer side is at most `MAX_SIDE_PX`, and its view."""
     path, view = folder / image.view.name, limited_view(image.view)
-    return _undistorted(path, file_state(path), image.intrinsics, view.camera), view
+    how = reading_options()
+    return _undistorted(path, file_state(path), image.intrinsics, view.camera, how), view
 
 
 @lru_cache(maxsize=CACHED_IMAGES)
 def _undistorted(
-    path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, camera: Camera
+    path: Path,
+    state: tuple[int, int],
+    intrinsics: CameraIntrinsics,
+    camera: Camera,
+    how: ReadingOptions,
 ) -> np.ndarray:
     """Read and undistort an image. A changed file has another `state`, so the cache misses it."""
     rgb = load_image(path, max_megapixels=np.inf)

@@ -28,12 +28,10 @@ FormatName = Literal["laz", "map", "mesh", "splat", "text"]
 LAZ_STEP_M = 0.001
 """Coordinates in LAZ files are rounded to multiples of this, in metres."""
 
-MESH_MARGIN = 0.5
-"""The robust box of points for meshing is extended on each side by this fraction of its size."""
-
-MESH_DEPTHS, MESH_TRIM = (6, 12), 3
-"""A mesh's octree has a depth between the `MESH_DEPTHS`, which grows with the number of points. The
-surface is cut away where the octree is over `MESH_TRIM` levels coarser. Chosen by hand."""
+MESH_MARGIN, MESH_DEPTHS, MESH_TRIM = 0.5, (6, 12), 3
+"""A mesh takes points in their robust box, extended on each side by `MESH_MARGIN` of its size. The
+depth of its octree is between `MESH_DEPTHS`, and the surface is cut away where the octree is over
+`MESH_TRIM` levels coarser. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
 """A mesh needs this number of points: with only a handful, COLMAP's meshing crashes the process."""
@@ -101,10 +99,8 @@ def write_map(found: MultiViewReconstruction, folder: Path, output: Path) -> Non
 def _in_utm(found: MultiViewReconstruction, what: str) -> tuple[np.ndarray, int]:
     place = found.georeference
     if not isinstance(place, Georeference) or place.origin is None:
-        raise ReconstructionError(
-            f"{what} needs a georeferenced model: take photographs with GPS, or give ground "
-            "control points"
-        )
+        how = "take photographs with GPS, or give ground control points"
+        raise ReconstructionError(f"{what} needs a georeferenced model: {how}")
     return place.origin.to_utm(found.cloud.points)
 
 
@@ -159,10 +155,9 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Format(NamedTuple):
-    """A file format of a model.
+    """A file format of a model: how it is written, its files, and the packages that it needs.
 
-    `write` takes the model, the folder of the images and the output folder. `files` are the names
-    of the files that it writes, `packages` the Python packages that it needs.
+    `write` takes the model, the folder of the images and the output folder.
     """
 
     write: Callable[[MultiViewReconstruction, Path, Path], None]

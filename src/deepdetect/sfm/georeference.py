@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,10 +16,12 @@ import numpy as np
 from .._shared.errors import NoPlaceError, OptionError, ReconstructionError
 from ..geometry.camera import PosedView
 from ..geometry.similarity import (
+    MIN_POINTS,
     MUCH_BETTER,
     WRONG_STDS,
     Similarity,
     SimilarityFit,
+    changes,
     fit_similarity,
 )
 from ..io.gps import ELLIPSOID, SEA_LEVEL, TAKE_OFF, GpsFix, read_gps
@@ -30,44 +32,31 @@ from .mapping import SparseModel
 
 __all__ = ["ControlRow", "Georeference", "Origin", "georeference", "read_control_points"]
 
-GPS_ACCURACY_M = 3.0
-"""Assumed accuracy of GPS positions that state none. Usual receivers reach it in the open."""
+GPS_ACCURACY_M, CONTROL_ACCURACY_M = 3.0, 0.1
+"""Assumed accuracies: of GPS positions that state none, as usual receivers reach it in the open,
+and of control points, surveyed to centimetres and marked to within a few pixels."""
 
-CONTROL_ACCURACY_M = 0.1
-"""Assumed accuracy of control points: surveyed to centimetres, marked to within a few pixels."""
-
-MIN_FIXES = 3
-"""A fit needs this number of positions: two would leave open the rotation about their line."""
-
-MAX_SCALE_STD = 0.25
-"""A model is georeferenced only if the relative standard deviation of its scale is below this. The
-deviation is larger if the positions lie too close together for their accuracy. Chosen by hand."""
-
-MAX_HEADING_STD_DEG = 20.0
-"""A georeferenced model's direction to north is at least this certain. Chosen by hand."""
+MAX_SCALE_STD, MAX_HEADING_STD_DEG = 0.25, 20.0
+"""The relative standard deviation of a georeferenced model's scale, and the standard deviation of
+its direction to north, are below these. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""If the positions leave the rotation about an axis less certain than this, a note says that this
-rotation relies on the assumption of upright cameras."""
+"""A note is made if the positions leave the rotation about an axis less certain than this."""
 
-GRAVITY_STD_DEG = 2.0
-"""Assumed standard deviation of the angles that a drone's gimbal reports. Chosen by hand."""
-
-UPRIGHT_STD_DEG, AHEAD_STD_DEG = 5.0, 25.0
-"""Assumed standard deviations without a gimbal: of image rows from level, and of the mean of all
-optical axes from level. Chosen by hand."""
+GRAVITY_STD_DEG, UPRIGHT_STD_DEG, AHEAD_STD_DEG = 2.0, 5.0, 25.0
+"""Assumed standard deviations of a gimbal's angles, and without a gimbal of image rows and of the
+mean of all optical axes from level. Chosen by hand."""
 
 DOWNWARD_SHARE = 0.1
 """Without a gimbal, "down" is first taken as the mean direction of the image columns plus this
 weight times the mean optical axis, because cameras look down more often than up. Chosen by hand."""
 
 MAX_DISTANCE_PX = 15.0
-"""A pixel that the user gives as the end of a known distance stands for a point of the model that
-projects to within this distance of the pixel. Chosen by hand."""
+"""An end of a known distance stands for a point of the model that projects to within this distance
+of the given pixel. Chosen by hand."""
 
 MAX_BEND = 0.05
-"""A bent model has residuals of up to this share of the extent of its points; a mistake in the
-control points mostly makes larger ones. Chosen by hand."""
+"""A bent model has residuals of up to this share of the extent of its points. Chosen by hand."""
 
 READINGS: dict[str, tuple[list[int], float]] = {
     "heights are in feet": ([0, 1, 2], 0.3048),
@@ -79,8 +68,7 @@ that correct each one."""
 
 CAUSES = "the units, the order of the columns, the coordinate system, and the names of the images"
 
-NEARLY_A_LINE = "the positions lie nearly on a line: the rotation of the model about this line \
-follows from the assumption that the cameras are held upright"
+NEARLY_A_LINE = "the positions lie nearly on a line: that the cameras are held upright is assumed"
 
 
 @dataclass(frozen=True)
@@ -93,15 +81,14 @@ class Origin:
 
     def to_enu(self, places: np.ndarray) -> np.ndarray:
         """Convert (N, 3) latitudes, longitudes, heights to metres east, north, up of the origin."""
-        where = self.latitude, self.longitude, self.height
-        return np.asarray(_ellipsoid().ellipsoid_to_enu(places, *where))
+        return np.asarray(_ellipsoid().ellipsoid_to_enu(places, *vars(self).values()))
 
     def to_utm(self, enu: np.ndarray) -> tuple[np.ndarray, int]:
         """Convert (N, 3) metres to UTM in the origin's zone; also return the zone's EPSG number."""
-        where = self.latitude, self.longitude, self.height
         # pycolmap uses the UTM zone of the first point, so the origin is put first.
         all_ = np.vstack([np.zeros((1, 3)), np.asarray(enu, np.float64)])
-        found, zone = _ellipsoid().ellipsoid_to_utm(_ellipsoid().enu_to_ellipsoid(all_, *where))
+        places = _ellipsoid().enu_to_ellipsoid(all_, *vars(self).values())
+        found, zone = _ellipsoid().ellipsoid_to_utm(places)
         return np.asarray(found)[1:], (32600 if self.latitude >= 0 else 32700) + int(zone)
 
 
@@ -116,10 +103,8 @@ class Georeference:
 
     Attributes:
         similarity: similarity from the frame of the mapping to the world.
-        source: "GPS", "ground control points", or "known distance", which gives a scale but no
-            place.
-        origin: origin of the world, whose axes point east, north and up; None if only the scale is
-            known.
+        source: "GPS", "ground control points", or "known distance", which gives only a scale.
+        origin: that of the world, whose axes point east, north and up; None for a known distance.
         residuals: given position minus position in the model, (3,) in metres east, north and up, by
             name of the image (GPS) or of the control point.
         wrong: images or control points that were left out, because they contradict the others.
@@ -173,12 +158,8 @@ def georeference(
 ) -> Georeference | str:
     """Find the scale and place of a model, or return a sentence on why even the scale is unknown.
 
-    Args:
-        sparse: the model.
-        points: (N, 3) dense points. The ends of the known distance may be dense or sparse points.
-        folder: folder of the images.
-        control: ground control points, which are used instead of GPS.
-        scale_by: known distance, as in `MultiViewOptions`, which alone then determines the scale.
+    `points` (N, 3) are the dense points, and `folder` holds the images. Ground control points are
+    used instead of GPS, and a known distance, as in `MultiViewOptions`, alone determines the scale.
 
     Raises:
         OptionError: an end of the distance is not in the model, or it has too few control points.
@@ -198,23 +179,22 @@ def georeference(
 
 
 def require_fixes(folder: Path, what: str) -> None:
-    """Raise an OptionError if fewer than `MIN_FIXES` images below a folder have a GPS position."""
+    """Raise an OptionError if fewer than `MIN_POINTS` images below a folder have a GPS position."""
     found = sum(read_gps(path) is not None for path in find_images(folder))
-    if found < MIN_FIXES:
+    if found < MIN_POINTS:
         raise OptionError(
-            f"{what} needs {MIN_FIXES} images with a GPS position, and there are {found}: leave "
+            f"{what} needs {MIN_POINTS} images with a GPS position, and there are {found}: leave "
             "the format out, or give ground control points"
         )
 
 
 def require_images(
-    names: Iterable[str],
+    names: Collection[str],
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
     """Raise an OptionError if `scale_by` names no image, or images show too few control points."""
-    names = [*names]
-    named = {Path(name).name: name for name in names} | {name: name for name in names}
+    named = _by_file_name(names)
     if control is not None:
         _seen_by_several(control, named)
     if scale_by is not None:
@@ -227,13 +207,12 @@ def georeference_by_gps(
 ) -> Georeference:
     """Find the place of a model by the GPS positions of its images, which are below a folder.
 
-    `scale` is in metres per unit of the model, or None if it is unknown. If no place is found, a
-    ReconstructionError says why.
+    `scale` is in metres per unit, if known. If no place is found, a ReconstructionError says why.
     """
     fixes = {name: fix for name in views if (fix := read_gps(folder / name)) is not None}
-    if len(fixes) < MIN_FIXES:
+    if len(fixes) < MIN_POINTS:
         raise ReconstructionError(
-            f"{len(fixes)} of the images have GPS, but {MIN_FIXES} are needed"
+            f"{len(fixes)} of the images have GPS, but {MIN_POINTS} are needed"
         )
     if assumed := [name for name, fix in fixes.items() if fix.assumed_hemisphere]:
         what = f"the GPS of {len(assumed)} images, such as {assumed[0]}, lacks N or S, or E or W"
@@ -243,10 +222,9 @@ def georeference_by_gps(
     places = np.column_stack([places, altitudes])
     stated = [fix.accuracy_m for fix in fixes.values() if fix.accuracy_m is not None]
     accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M
-    up, level, stds = upright(views, {name: fix.gravity for name, fix in fixes.items()})
+    level = upright(views, {name: fix.gravity for name, fix in fixes.items()})
     centres = {name: views[name].centre for name in fixes}
-    known: Any = {"scale": scale, "up": up, "level": level, "level_stds": stds}
-    return _place("GPS", centres, places, accuracy, heights, **known)
+    return _place("GPS", centres, places, accuracy, heights, level, scale)
 
 
 def _altitudes(fixes: Sequence[GpsFix]) -> tuple[str, np.ndarray]:
@@ -270,17 +248,21 @@ def _place(
     places: np.ndarray,
     accuracy: float,
     heights: str,
+    level: tuple[np.ndarray, np.ndarray, np.ndarray],
+    scale: float | None,
     error: float | None = None,
-    **known: Any,
 ) -> Georeference:
+    """Fit a model to places; `error` is that of control points in the model, in its unit."""
     unknown = np.isnan(places[:, 2])
     places = np.where(np.isnan(places), 0 if unknown.all() else np.nanmedian(places[:, 2]), places)
+    places[:, 1] = np.unwrap(places[:, 1], period=360)
     latitude, longitude, height = np.median(places, axis=0).tolist()
-    origin = Origin(round(latitude, 6), round(longitude, 6), round(height, 1))
+    origin = Origin(round(latitude, 6), round((longitude + 180) % 360 - 180, 6), round(height, 1))
     targets = origin.to_enu(places)
     targets[unknown, 2] = np.nan
     own = np.array([*points.values()])
-    known["accuracy"], fit = accuracy, None
+    known: Any = dict(zip(("up", "level", "level_stds"), level, strict=True))
+    known, fit = {**known, "scale": scale, "accuracy": accuracy}, None
     with suppress(ReconstructionError):
         fit = fit_similarity(own, targets, **known)
         if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
@@ -307,7 +289,7 @@ def _check_control_points(
     """Raise a NoPlaceError if control points contradict a model, or fit better if read otherwise.
 
     They contradict it if most residuals exceed what the accuracy of the targets, the `error` of the
-    points in the model, and a bend of the model explain.
+    points in the model, and a bend of the model explain. A bend is told.
     """
     own, names = np.array([*points.values()]), [*points]
 
@@ -316,13 +298,16 @@ def _check_control_points(
         relative = away / np.hypot(known["accuracy"], found.similarity.scale * error) / factor
         return away, relative, float((np.minimum(relative, WRONG_STDS) ** 2).sum())
 
-    likely, worst, cost = CAUSES, "", len(names) * WRONG_STDS**2
+    likely, worst, cost, bent = CAUSES, "", len(names) * WRONG_STDS**2, False
     if fit is not None:
         away, relative, cost = misfit(fit)
-        for k in np.argsort(-away)[:MIN_FIXES]:
+        for k in np.argsort(-away)[:MIN_POINTS]:
             worst += f", {names[k]} by {away[k]:.3g} m"
-        bent = np.median(away) < MAX_BEND * np.nan_to_num(targets).std(axis=0).max()
-        likely = "" if bent or np.median(relative) < WRONG_STDS else CAUSES
+        # Three points always agree, so more than these must outnumber those that do not.
+        few = 2 * (relative > WRONG_STDS).sum() <= len(names) - MIN_POINTS
+        agreed = few and np.median(relative) < WRONG_STDS
+        bent = cost > len(names) and _is_bent(fit, targets)
+        likely = "" if agreed or bent else CAUSES
     for reading, (axes, factor) in READINGS.items() if cost > len(names) else ():
         with suppress(ReconstructionError):
             other = fit_similarity(own, targets[:, axes] * [1, 1, factor], **known)
@@ -330,16 +315,41 @@ def _check_control_points(
                 likely = f"whether {reading}, which fits far better"
     if likely:
         raise NoPlaceError(f"the ground control points contradict the model{worst}: check {likely}")
+    if bent:
+        text = f"the model is bent and misses ground control points{worst}: calibrate the camera"
+        warnings.warn(f"{text}, or add images that look obliquely", UserWarning, stacklevel=2)
+
+
+def _is_bent(fit: SimilarityFit, targets: np.ndarray) -> bool:
+    """Return whether a bend that grows with the squared distance explains most residuals.
+
+    Each point is compared with what the others predict, so errors at random are no bend.
+    """
+    known = np.isfinite(targets[:, 2])
+    at, residuals = targets[known], fit.residuals[known]
+    if len(at) < MIN_POINTS:
+        return False
+    moves = changes(at)
+    bends = (at[:, :2] ** 2).sum(axis=1)[:, None, None] * np.eye(3)
+    misses = []
+    for used in (moves, np.concatenate([moves, bends], axis=2)):
+        left = residuals.copy()
+        for k in range(len(at)):
+            others = np.arange(len(at)) != k
+            matrix = used[others].reshape(-1, used.shape[2])
+            left[k] -= used[k] @ np.linalg.lstsq(matrix, residuals[others].ravel())[0]
+        misses.append(np.median(np.linalg.norm(left, axis=1)))
+    straight, bent = misses
+    return bool(straight < MAX_BEND * at.std(axis=0).max() and bent < MUCH_BETTER * straight)
 
 
 def upright(
     views: Mapping[str, PosedView], gravities: Mapping[str, np.ndarray | None] = {}
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Estimate from the cameras which direction is up, and which directions are level.
+    """Return the unit vector up (3,), and `level` (L, 3) and `level_stds` of `fit_similarity`.
 
     If a gimbal reports gravity, directions perpendicular to it are level. Otherwise, image rows
-    and, less certainly, optical axes are assumed to be level. Returns the unit vector up (3,) and,
-    for `fit_similarity`, level vectors (L, 3) and their standard deviations (L,) in radians.
+    and, less certainly, optical axes are assumed to be level.
     """
     level, stds, down = [], [], []
     for name, view in views.items():
@@ -367,42 +377,41 @@ def georeference_by_control_points(
     seen = _seen_by_several(control, _by_file_name(sparse.images))
     points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
     places = np.array([next(iter(rows.values())).place for rows in seen.values()])
-    up, level, stds = upright(sparse.views)
-    known: Any = {"scale": scale, "up": up, "level": level, "level_stds": stds}
     views = [(sparse.images[image].view, point) for point in seen for image in seen[point]]
     pixels = [np.linalg.norm(points[k] - v.centre) / v.camera.focal_px[0] for v, k in views]
     error = float(np.median(pixels) * np.median(sparse.errors))
     what = "ground control points", points, places, CONTROL_ACCURACY_M, control[0].heights
-    return _place(*what, error, **known)
+    return _place(*what, upright(sparse.views), scale, error)
 
 
 def _seen_by_several(
     control: Sequence[ControlRow], names: Mapping[str, str]
 ) -> dict[str, dict[str, ControlRow]]:
-    """Return the control points that are marked in two or more of the named images.
+    """Return the control points marked in two or more of the images, by name, then by image.
 
-    `names` maps image names in the file to full names. The result is by point, then by full name.
+    `names` maps image names in the file to full names. One place is one point, because remarks on
+    the mark may follow its name.
     """
-    seen: dict[str, dict[str, ControlRow]] = {}
+    rows: dict[str, dict[str, ControlRow]] = {}
+    place_of: dict[str, str] = {}
     for row in control:
         if row.image in names:
-            rows = seen.setdefault(row.name, {})
-            rows[names[row.image]] = row
-            if not np.array_equal(row.place, next(iter(rows.values())).place, equal_nan=True):
+            place = str(row.place)  # as text, NaN is equal to itself
+            rows.setdefault(place, {})[names[row.image]] = row
+            if place_of.setdefault(row.name, place) != place:
                 raise NoPlaceError(f"{row.name} is the name of two control points: change one")
-    seen = {name: rows for name, rows in seen.items() if len(rows) > 1}
-    if len(seen) < MIN_FIXES:
+    seen = {next(iter(each.values())).name: each for each in rows.values() if len(each) > 1}
+    if len(seen) < MIN_POINTS:
         raise OptionError(
             f"{len(seen)} ground control points are marked in two or more images of the model, but "
-            f"{MIN_FIXES} are needed: mark more points, and name each image by its file, with the "
+            f"{MIN_POINTS} are needed: mark more points, and name each image by its file, with the "
             "folder if two files have the same name"
         )
     return seen
 
 
-def _by_file_name(names: Iterable[str]) -> dict[str, str]:
+def _by_file_name(names: Collection[str]) -> dict[str, str]:
     """Map names that users may give (full names, and file names if unique) to full names."""
-    names = [*names]
     counts = Counter(Path(name).name for name in names)
     alone = {Path(name).name: name for name in names if counts[Path(name).name] == 1}
     return {**alone, **{name: name for name in names}}
@@ -426,8 +435,8 @@ def scale_by_distance(
 ) -> float:
     """Return the metres per unit of a model, from the known distance between two places in it.
 
-    An end is the name of an image, for the position of its camera, or NAME:X,Y, for the one of the
-    `points` (N, 3) that this pixel of the image shows.
+    An end is the NAME of an image, for its camera, or NAME:X,Y, for the point of `points` (N, 3)
+    that this pixel shows.
     """
     one, other = (_end(end, sparse, points) for end in (end0, end1))
     length = float(np.linalg.norm(one - other))

@@ -1,8 +1,7 @@
 """Find and correct images to which the mapping gave a wrong pose.
 
 If the camera moves straight ahead, an image that is registered early, by few points, may get a
-wrong place on the path. It then stays there, because points whose depth comes from this image agree
-with the wrong place. Points whose depth comes from other images show the error.
+wrong place on the path. Only points whose depth comes from other images then show the error.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from .colmap import quiet_pycolmap
 from .mapping import MAX_VERIFICATION_ERROR_PX, MIN_ANGLE_DEG, MIN_VERIFIED, adjust
 
 MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
-"""A point tests an image only if the other images' lines of sight to the point spread by this angle
-(root mean square). Otherwise, the point got its depth from the tested image itself."""
+"""A point tests an image only if the other images' lines of sight to it spread by this angle (root
+mean square). Otherwise, its depth came from the tested image itself."""
 
 MIN_GAIN = 1.5
 """An image is moved if the number of points that agree with a pose grows at least by this factor.
@@ -46,8 +45,7 @@ def correct_places(
 ) -> Any:
     """Return a `pycolmap.Reconstruction` in which misplaced images have been moved to better poses.
 
-    `database` is the one that the mapping used. If an image is moved, all points are triangulated
-    again, and a bundle adjustment follows. With `quiet`, no progress bar is shown.
+    `database` is that of the mapping. After a move, all points are triangulated and adjusted again.
     """
     for _ in range(MAX_ROUNDS):
         with quiet_pycolmap() as pycolmap:
@@ -82,7 +80,10 @@ def _better_places(
         partners = _partners(pycolmap, opened, points.seen)
         for number in points.seen:
             bar.update()
-            matches = [(other, _matches(opened, number, other)) for other in partners[number]]
+            matches = (
+                (other, opened.read_two_view_geometry(number, other).inlier_matches)
+                for other in partners[number]
+            )
             keypoints, rows = points.matched(number, matches)
             image, places = model.images[number], points.xyz[rows]
             xy = points.keypoints[number][keypoints]
@@ -99,10 +100,8 @@ def _better_places(
 class _Points:
     """The points of a model, and which keypoints of which images see them.
 
-    Attributes:
-        xyz: (P, 3) positions of the points.
-        keypoints: (K, 2) pixels of all keypoints of an image, by image number.
-        seen: (K,) index of the point that each keypoint of an image sees, or -1, by image number.
+    `xyz` (P, 3) are positions. By image number, `keypoints` (K, 2) are pixels, and `seen` (K,) are
+    the indices of the points that they see, or -1.
     """
 
     def __init__(self, model: Any) -> None:
@@ -127,10 +126,9 @@ class _Points:
     def matched(
         self, number: int, matches: Iterable[tuple[int, np.ndarray]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Match the keypoints of an image to the points whose depth other images determine.
+        """Return indices of an image's keypoints, and of their points with depth from others.
 
-        `matches` are numbers of other images, each with (M, 2) indices of matching keypoints in
-        this image and in the other image. Returns indices of keypoints and of their points.
+        `matches` are other images, each with (M, 2) indices of matching keypoints in both images.
         """
         own, sights = self._sights[number]
         counts, sums = self._counts.copy(), self._sums.copy()
@@ -140,7 +138,8 @@ class _Points:
         lengths = np.linalg.norm(sums, axis=1) / np.maximum(counts, 1)
         well = (counts > 1) & (lengths < np.cos(np.radians(MIN_SPREAD_DEG)))
         found = [np.empty(0, np.int64)]
-        for other, pairs in matches:
+        for other, inliers in matches:
+            pairs = np.asarray(inliers, np.int64).reshape(-1, 2)
             rows = self.seen[other][pairs[:, 1]]
             kept = (rows >= 0) & well[rows]
             found.append(pairs[kept, 0] * len(self.xyz) + rows[kept])
@@ -157,12 +156,6 @@ def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int,
             partners[first].append(second)
             partners[second].append(first)
     return partners
-
-
-def _matches(database: Any, number: int, other: int) -> np.ndarray:
-    """Return the inlier matches of two images, (M, 2) indices of keypoints."""
-    matches = database.read_two_view_geometry(number, other).inlier_matches
-    return np.asarray(matches, np.int64).reshape(-1, 2)
 
 
 def _agreeing(camera: Any, xy: np.ndarray, points: np.ndarray, pose: Any) -> int:

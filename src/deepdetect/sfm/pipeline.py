@@ -17,6 +17,7 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import NoDepthError, OptionError, ReconstructionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
+from ..batch.extraction import noted_range
 from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
@@ -24,6 +25,8 @@ from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, Camera, PosedView, check_camera_file
 from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
+from ..io.image import one_range
+from ..io.image_file import read_with, reading_options
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras
 from .formats import FORMATS, FormatName, check_formats
@@ -111,6 +114,22 @@ def reconstruct_many(
     folder = stages.folder_of(images)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
         require_fixes(folder, f"the format {placed[0]}")
+    paths = [folder / name for name in check_images(folder)]
+    with read_with(reading_options(deep_range=noted_range(stages.features))), one_range(paths):
+        return _reconstruct(stages, folder, detector, selection, calibration, focal_px, control)
+
+
+def _reconstruct(
+    stages: Stages,
+    folder: Path,
+    detector: DeepDetect | PointDetector,
+    selection: SelectionOptions | None,
+    calibration: Camera | Calibration | str | Path | None,
+    focal_px: float | None,
+    control: list[ControlRow] | None,
+) -> MultiViewReconstruction:
+    """Run the stages, and write all files."""
+    target, options = stages.output, stages.options
     timer = StageTimer()
     with timer.stage("features"):
         sizes, keypoints, unregistered = stages.extract(folder, detector, selection)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,6 +91,7 @@ class MultiViewReconstruction:
 
     def summary(self) -> dict[str, Any]:
         """Return everything except the arrays of points, as plain Python types for JSON."""
+        by_views = Counter(self.dense_views.tolist())
         return {
             "images": len(self.views) + len(self.unregistered),
             "registered": len(self.views),
@@ -108,7 +110,7 @@ class MultiViewReconstruction:
             "mean_sparse_reprojection_error_px": _rounded(self.sparse_errors, np.mean),
             "dense_points": len(self.dense),
             "median_dense_reprojection_error_px": _rounded(self.dense_errors, np.median),
-            "dense_points_by_views": _counts(self.dense_views),
+            "dense_points_by_views": {str(n): count for n, count in sorted(by_views.items())},
             "cameras": {name: self._camera(name) for name in self.views},
             "seconds": {stage: round(value, 3) for stage, value in self.seconds.items()},
         }
@@ -138,8 +140,3 @@ def _place(georeference: Georeference | str) -> dict[str, Any]:
 
 def _rounded(values: np.ndarray, function: Any) -> float | None:
     return round(float(function(values)), 4) if len(values) else None
-
-
-def _counts(values: np.ndarray) -> dict[str, int]:
-    found, counts = np.unique(values, return_counts=True)
-    return {str(value): int(count) for value, count in zip(found, counts, strict=True)}

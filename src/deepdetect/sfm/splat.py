@@ -21,7 +21,7 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .result import MultiViewReconstruction
 
 SPLAT_POINTS = 200_000
-"""Training starts from at most this number of dense points. Trainers add more. Chosen by hand."""
+"""Training starts from at most this number of dense points. Chosen by hand."""
 
 JPEG_QUALITY = 95
 
@@ -30,8 +30,8 @@ CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
 less than `CLOSED_GAIN` times the area: few gaps are left then. Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
-"""A pixel of a depth map whose depth exceeds that of a neighbouring pixel by more than this
-fraction is left out: it is seen through a gap in a nearer surface. Chosen by hand."""
+"""A pixel whose depth exceeds a neighbour's by more than this fraction is left out: it is seen
+through a gap in a nearer surface. Chosen by hand."""
 
 DEPTH_PERCENT = 95.0
 """The depths of this percentage of the sparse points in each view must fit into 16 bits."""
@@ -51,10 +51,9 @@ def write_transforms(
     points: Path,
     **more: Any,
 ) -> None:
-    """Write nerfstudio's transforms.json.
+    """Write nerfstudio's transforms.json, with the point cloud `points`, and `more` at its top.
 
-    `files` maps a JSON key, such as "file_path", to the file of each image, by image name. `points`
-    is the file of the point cloud, and `more` are further values at the top level.
+    `files` maps a JSON key, such as "file_path", to the file of each image, by image name.
     """
 
     def relative(file: Path) -> str:
@@ -104,13 +103,9 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
             stacklevel=2,
         )
     intrinsics = {name: centred[own] for name, own in found.intrinsics.items()}
-    views = {
-        name: replace(view, camera=intrinsics[name].pinhole) for name, view in found.views.items()
-    }
-    names = {
-        name: name if Path(name).suffix.lower() in (".jpg", ".jpeg", ".png") else f"{name}.jpg"
-        for name in views
-    }
+    views = {n: replace(view, camera=intrinsics[n].pinhole) for n, view in found.views.items()}
+    kept = (".jpg", ".jpeg", ".png")
+    names = {n: n if Path(n).suffix.lower() in kept else f"{n}.jpg" for n in views}
     images = {name: target / "images" / names[name] for name in views}
     depths = {name: target / "depths" / f"{names[name]}.png" for name in views}
     reach = max(
@@ -142,24 +137,18 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
             camera.width, camera.height = pinhole.width, pinhole.height
             image.name = names[image.name]
         for row in chosen:
-            number = model.add_point3D(
-                found.dense.points[row], pycolmap.Track(), found.dense.colors[row]
-            )
-            model.points3D[number].error = found.dense_errors[row]
+            point = found.dense.points[row], pycolmap.Track(), found.dense.colors[row]
+            model.points3D[model.add_point3D(*point)].error = found.dense_errors[row]
         (target / "sparse" / "0").mkdir(parents=True, exist_ok=True)
         model.write(target / "sparse" / "0")
         model.export_PLY(target / "points.ply")
     files = {"file_path": images, "depth_file_path": depths}
-    unit = {"depth_unit_scale_factor": 1 / scale}
-    path = target / "transforms.json"
-    write_transforms(path, views, intrinsics, files, target / "points.ply", **unit)
+    what = target / "transforms.json", views, intrinsics, files, target / "points.ply"
+    write_transforms(*what, depth_unit_scale_factor=1 / scale)
 
 
 def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
-    """Choose at most `count` of the points (N, 3), evenly in space, and return their indices.
-
-    Space is divided into cubic cells. The point with the least error in each cell is chosen.
-    """
+    """Return the indices of at most `count` points (N, 3): the best in each cubic cell of space."""
     order = np.argsort(errors, kind="stable")
     if len(points) <= count:
         return order
@@ -169,8 +158,7 @@ def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
         cell = (low + high) / 2
         cells = np.floor((points[order] - points.min(axis=0)) / cell).astype(np.int64)
         keys = cells @ np.array([1, 2_097_152, 2_097_152**2])  # 21 bits for each axis
-        rows = np.unique(keys, return_index=True)[1]
-        if len(rows) > count:
+        if len(rows := np.unique(keys, return_index=True)[1]) > count:
             low = cell
         else:
             high, best = cell, order[rows]

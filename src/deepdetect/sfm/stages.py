@@ -41,8 +41,8 @@ from ..features.keypoints import Keypoints
 from ..features.match_filter import suits_filter
 from ..features.selection import SelectionOptions
 from ..geometry.camera import PosedView
-from ..io.image import find_images, load_image, luma, name_images, one_range
-from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with
+from ..io.image import find_images, load_image, luma, name_images
+from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
 from ..io.projection import require_pinhole
 from ..matching.overlay import find_overlay, tell_still
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
@@ -427,14 +427,12 @@ class Stages:
         for old in store.glob("*.npz"):
             if old not in paths.values():
                 old.unlink()
-        with one_range([folder / name for name in check_images(folder)]) as reading:
-            pass
         work = partial(
             _depth_task,
             folder=folder.absolute(),
             points=sparse.points,
             stride_px=stride,
-            reading=reading,
+            reading=reading_options(),
         )
         workers, done = self._dense_workers(sparse), len(paths) - len(tasks)
         with progress(len(paths), "dense points", "image", self.quiet, done) as bar:

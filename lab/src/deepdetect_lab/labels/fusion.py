@@ -6,6 +6,7 @@ PNG file.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +21,7 @@ from deepdetect._shared.records import Outputs
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import save_mask
 from deepdetect.io.picture_file import save_picture
-from deepdetect.viz.draw import add_caption, join_pictures
+from deepdetect.viz.draw import add_caption
 
 from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
@@ -163,3 +164,15 @@ def label_file(task: LabelTask) -> dict[str, Any] | str:
         save_mask(label.mask, task.mask)
     files = {"image": task.image, "mask": task.mask}
     return {**files, "visibility": label.visibility, "density": label.density}
+
+
+def join_pictures(panels: Sequence[np.ndarray], columns: int, gap_px: int = 6) -> np.ndarray:
+    """Join images of one size in a grid of `columns` columns, with white gaps."""
+    height, width = panels[0].shape[:2]
+    rows = -(-len(panels) // columns)
+    size = rows * (height + gap_px) - gap_px, columns * (width + gap_px) - gap_px, 3
+    joined = np.full(size, 255, np.uint8)
+    for k, panel in enumerate(panels):
+        top, left = k // columns * (height + gap_px), k % columns * (width + gap_px)
+        joined[top : top + height, left : left + width] = panel
+    return joined

@@ -13,8 +13,9 @@ import numpy as np
 from deepdetect._shared.errors import ImageError
 from deepdetect._shared.opencv import cv2
 from deepdetect._shared.records import file_digest, key
-from deepdetect.io.image import find_images, load_image, luma, scale_short_side
+from deepdetect.io.image import find_images, load_image, luma
 
+from ..datasets.scaling import scale_short_side
 from ..labels import LabelOptions, fuse
 from ..labels.settings import Visibility
 from .augmentation import AUGMENTATION_VERSION, Darkening, augment, darken, draw_darkening

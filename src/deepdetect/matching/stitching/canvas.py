@@ -29,12 +29,9 @@ MAX_DEPTH_RATIO = 5.0
 """The depths of an image's corners on a flat canvas must differ by less than this factor, because
 images near the horizon are stretched without bound. Chosen by hand; not measured."""
 
-MIN_WARP_SCALE = 0.67
-"""Images drawn at a scale below this are blurred first, because they would alias otherwise."""
-
-MIN_SHOWN_PX = 16
-"""An image whose longer side is drawn with fewer pixels than this is blurred as if drawn with this
-many, because wider blurs take minutes."""
+MIN_WARP_SCALE, MIN_SHOWN_PX = 0.67, 16
+"""Images drawn at a scale below MIN_WARP_SCALE would alias and are blurred first, at most as if the
+longer side were drawn with MIN_SHOWN_PX, because wider blurs take minutes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +51,10 @@ class WarpedImage:
 class Canvas:
     """The boxes that images cover on a canvas, and the function that draws them there.
 
-    The keys of `boxes` are image numbers. A `closed` canvas shows 360 degrees, so its right border
-    continues at the left. If this border splits an image, the rest of the image has a second box,
-    with the key ~number. `draw(place, rgb, scale_of_image, scale_of_canvas)` warps an image for the
-    box with the key `place`. The scales are those of reduced copies, 1 at full size.
+    The keys of `boxes` are image numbers. The right border of a `closed` canvas, of 360 degrees,
+    continues at the left. If it splits an image, the rest has a second box, with the key ~number.
+    `draw(place, rgb, scale_of_image, scale_of_canvas)` warps an image for the box with the key
+    `place`. The scales are those of reduced copies, 1 at full size.
     """
 
     boxes: dict[int, Box]
@@ -104,10 +101,9 @@ def least_distorted(sizes: Sizes, homographies: Matrices) -> int:
 def plan_plane(
     sizes: Sizes, homographies: Matrices, reference: int, scale: float
 ) -> tuple[Canvas, dict[int, np.ndarray]]:
-    """Find the smallest flat canvas that holds all images.
+    """Find the smallest flat canvas that holds all images, and their homographies to it.
 
-    It has `scale` pixels per pixel of the reference image. The given homographies map to any common
-    frame, the returned ones to the canvas.
+    It has `scale` pixels per pixel of the reference. `homographies` map to any common frame.
     """
     back = np.linalg.inv(homographies[reference])
     placed = {number: back @ matrix for number, matrix in homographies.items()}
@@ -157,18 +153,14 @@ def plan_curved(
 ) -> Canvas:
     """Find the smallest canvas of all images on a cylinder or a sphere.
 
-    The canvas has `scale` pixels per pixel at the centre of the reference image, and a full turn is
-    rounded to a whole number of pixels. If the images show 360 degrees, the borders of the canvas
-    cut through the image opposite the reference.
+    It has `scale` pixels per pixel at the centre of the reference, and a full turn is rounded to
+    whole pixels. If images show 360 degrees, its borders cut the one opposite the reference.
     """
     turn = round(2 * np.pi * cameras[reference].focal_px * scale)
     angles = {n: float(np.arctan2(*one.rotation[[0, 2], 2])) for n, one in cameras.items()}
 
     def aimed(number: int, start: float, canvas_scale: float, image_scale: float) -> Any:
-        """Return a warper for an image, its camera matrices, and the canvas column of its origin.
-
-        The origin lies in the middle of the image, so that the warped image is not split.
-        """
+        """Return a warper, camera matrices, and the canvas column of the image's middle."""
         radius = turn * canvas_scale / (2 * np.pi)
         middle = round((angles[number] - start) % (2 * np.pi) * radius)
         ahead = cv2.Rodrigues(np.array([0, -middle / radius - start, 0]))[0]
@@ -241,8 +233,8 @@ def _smooth(rgb: np.ndarray, shown: float) -> np.ndarray:
 def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
     """Return the depths of an image's corners, (4,), as seen by the camera of the common frame.
 
-    For equal cameras that only rotate, a depth is proportional to the cosine of the angle between
-    the corner and the optical axis of that camera. Beyond the horizon, depths are negative.
+    For equal cameras that only rotate, they are proportional to the cosines of the angles from its
+    optical axis. Beyond the horizon, they are negative.
     """
     # A determinant of 1, as for a rotation, fixes the arbitrary factor and the sign of the depths.
     matrix = homography / np.cbrt(np.linalg.det(homography))

@@ -13,6 +13,7 @@ from ..._shared.errors import OptionError, check_name
 from ..._shared.image_array import Channels, from_16_bits, to_8_bits
 from ..._shared.options import check_ranges, suggest_keywords, whole
 from ..._shared.progress import StageTimer
+from ..._shared.value_range import ValueRange
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
@@ -76,6 +77,7 @@ class Panorama:
         parallax: displacement along the seam in panorama pixels, by the numbers of both images, for
             pairs where it is visible because the camera moved between them.
         closed: whether the panorama shows 360 degrees, and its right border continues at the left.
+        value_range: the values of black and white in `image`, if it is uint16.
     """
 
     image: np.ndarray
@@ -89,6 +91,7 @@ class Panorama:
     seconds: dict[str, float]
     parallax: dict[tuple[int, int], float]
     closed: bool
+    value_range: ValueRange = (0, 65535)
 
     def __repr__(self) -> str:
         height, width = self.valid.shape
@@ -201,8 +204,9 @@ def stitch(
             small,
             canvas,
         )
-        if deep and reading.deep_range is not None:
-            panorama = np.where(valid[..., None], from_16_bits(panorama, reading.deep_range), 0)
+        values = (0, 65535) if not deep or reading.deep_range is None else reading.deep_range
+        if deep:
+            panorama = np.where(valid[..., None], from_16_bits(panorama, values), 0)
         if crop:
             left, top, right, bottom = crop_box(valid, canvas.closed)
             part = (slice(top, bottom), slice(left, right))
@@ -222,6 +226,7 @@ def stitch(
         timer.seconds,
         parallax,
         canvas.closed,
+        values,
     )
 
 

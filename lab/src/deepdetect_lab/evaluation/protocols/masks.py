@@ -12,9 +12,10 @@ import numpy as np
 from deepdetect._shared.errors import ImageError
 from deepdetect.detector.detector import DeepDetect
 from deepdetect.detector.heatmap import HeatmapOptions, compute_maps
-from deepdetect.io.image import MINIMUM_SIDE, load_image, luma, scale_short_side
+from deepdetect.io.image import MINIMUM_SIDE, load_image, luma
 from deepdetect.io.masks import load_mask
 
+from ...datasets.scaling import scale_short_side
 from ...labels import LabelOptions, fuse, visibility_of
 
 EPSILON = 1e-7
