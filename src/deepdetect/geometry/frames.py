@@ -8,7 +8,7 @@ from .._shared.machine import one_opencv_thread
 from .._shared.opencv import cv2
 
 MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
-MIN_SMOOTH_SHARE = 0.85
+MIN_SMOOTH_SHARE = 0.75
 """Pixels of a frame differ from its colour by at most this number of grey levels in each channel,
 about what JPEG leaves; the first share of the outermost pixels is exactly equal. Each part
 covers the second share of the image, one row of 500. The scene covers the third share; a video in
