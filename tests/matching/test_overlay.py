@@ -103,6 +103,34 @@ def test_a_small_baseline_keeps_the_far_parts(baseline: float, photo: np.ndarray
     assert not found.any()
 
 
+@pytest.mark.parametrize("rows", [slice(150, 300), slice(60, 300)])
+def test_far_parts_behind_near_ones_stay(rows: slice, photo: np.ndarray) -> None:
+    # Nothing lies between what moves by 15 px and what moves by 0.3 px.
+    far, near = cv2.resize(skimage.data.coffee(), (440, 340)), cv2.resize(photo, (440, 340))
+    views = []
+    for shift in (0, 1):
+        view, front = (
+            cv2.warpAffine(each, np.float32([[1, 0, -20 - move], [0, 1, -20]]), (400, 300))
+            for each, move in ((far, 0.3 * shift), (near, 15 * shift))
+        )
+        view[rows] = front[rows]
+        views.append(gray(compressed(view)))
+    assert not find_overlay(views).any()
+
+
+def test_a_time_stamp_and_a_display_are_found_at_night(facade, photo: np.ndarray) -> None:
+    scene, noise = facade(0.3), np.random.default_rng(0)
+    views = [
+        (0.15 * view + noise.normal(0, 2, view.shape)).clip(0, 255).astype(np.uint8)
+        for view in (scene.left, scene.right)
+    ]
+    for drawn in (caption, display):
+        masks = [drawn(view, photo) for view in views]
+    found = find_overlay([gray(compressed(view)) for view in views])
+    assert found[masks[0]].mean() > 0.6
+    assert found.mean() < 0.3
+
+
 def test_an_overlay_over_many_images_stands_still_in_all(facade, photo: np.ndarray) -> None:
     scene = facade(0.3)
     views = [np.array(each) for each in (scene.left, scene.right, scene.left[:, ::-1])]

@@ -110,3 +110,21 @@ def test_a_caption_over_all_images_holds_no_keypoint(tmp_path: Path, pycolmap) -
             x, y = file[f"{k}.png"]["keypoints"][()].T
             assert len(x) > 100
             assert not ((x > 22) & (x < 198) & (y > 182) & (y < 228)).any()
+
+
+def test_an_overlay_of_one_camera_among_several_is_found(facade, tmp_path: Path) -> None:
+    paths, pixels = [], np.random.default_rng(0).integers(0, 256, (12, 24, 3), np.uint8)
+    for size, marked in ((320, False), (400, True)):
+        scene = facade(0.3)
+        for number, view in enumerate((scene.left, scene.right, scene.left[:, ::-1])):
+            image = np.array(view)[:, :size]
+            if marked:
+                image[10:58, 20:116] = pixels.repeat(4, 0).repeat(4, 1)
+            paths.append(tmp_path / f"{size}-{number}.png")
+            Image.fromarray(image).save(paths[-1])
+    stages = Stages(tmp_path / "model", MultiViewOptions(), 1, quiet=True)
+    with pytest.warns(UserWarning, match="still"):
+        (overlay,) = stages.find_overlays([*reversed(paths)])
+    assert overlay.shape == (300, 400)
+    assert overlay[14:54, 24:112].mean() > 0.9
+    assert stages.left_out == overlay.mean() < 0.2

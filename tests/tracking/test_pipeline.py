@@ -5,6 +5,7 @@ import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -212,3 +213,34 @@ def test_no_track_follows_a_caption(moving_photo, tmp_path: Path) -> None:
         x, y = frame.xy.T
         assert len(frame) > 20
         assert not ((x > 22) & (x < 138) & (y > 12) & (y < 58)).any()
+
+
+def test_a_caption_of_a_camera_is_found_once_frames_were_seen(
+    moving_photo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Camera:
+        def __init__(self, _: int) -> None:
+            self.frames = 0
+
+        def isOpened(self) -> bool:
+            return True
+
+        def get(self, _: int) -> float:
+            return 0.0
+
+        def read(self):
+            frame = moving_photo(self.frames, (8, 5))
+            frame[10:60, 20:140] = moving_photo(0)[100:150, 60:180]
+            self.frames += 1
+            return self.frames <= 10, frame
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Camera)
+    monkeypatch.setattr("deepdetect.tracking.pipeline.MAX_STEP", 1)
+    with pytest.warns(UserWarning, match="still"):
+        report = track(0, tmp_path / "t.csv", options=FEW)
+    assert 0.05 < report.left_out < 0.3
+    x, y = load_tracks(tmp_path / "t.csv")[-1].xy.T
+    assert not ((x > 22) & (x < 138) & (y > 12) & (y < 58)).any()

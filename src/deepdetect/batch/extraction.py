@@ -41,7 +41,7 @@ def extract_features(
     detector: DeepDetect | PointDetector | None = None,
     *,
     selection: SelectionOptions | None = None,
-    ignore: np.ndarray | None = None,
+    ignore: np.ndarray | Sequence[np.ndarray] = (),
     max_megapixels: float | None = None,
     engine: str = "processes",
     workers: int | None = None,
@@ -74,7 +74,7 @@ def extract_features(
             because every process has a detector of its own.
         selection: which pixels of a `DeepDetect` heat map become keypoints; None: those with a
             probability above 0.5.
-        ignore: (H, W) array, true where images of this size get no keypoint.
+        ignore: (H, W) array, or one for each size, true where images of this size get no keypoint.
         max_megapixels: limit for an image, as in `load_image`; larger images count as failures.
         engine: "processes" for processes on this machine, or "ray" for a Ray cluster.
         workers: number of processes; default: one per processor.
@@ -115,8 +115,8 @@ def extract_features(
         else ROOT_SIFT,
         "version": __version__,
     }
-    if ignore is not None:
-        settings["ignore"] = key(ignore)
+    if len(masks := [ignore] if isinstance(ignore, np.ndarray) else [*ignore]):
+        settings["ignore"] = key(masks)
     report = fill_file(
         path,
         settings,
@@ -125,7 +125,7 @@ def extract_features(
             _extract,
             root=root,
             selection=selection,
-            ignore=ignore,
+            ignore=masks,
             detector=detector,
             reading=reading,  # other processes do not inherit these options
         ),
@@ -158,7 +158,7 @@ def _extract(
     root: Path,
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
-    ignore: np.ndarray | None,
+    ignore: Sequence[np.ndarray],
     reading: ReadingOptions,
 ) -> Iterator[Group]:
     for name, state in images:
@@ -166,8 +166,8 @@ def _extract(
             with read_with(reading):
                 rgb, hidden = load_visible(root / name)
             gray = luma(rgb)
-            if ignore is not None and ignore.shape == gray.shape:
-                hidden = ignore if hidden is None else hidden | ignore
+            for mask in (each for each in ignore if each.shape == gray.shape):
+                hidden = mask if hidden is None else hidden | mask
             keypoints = find_keypoints(detector, rgb, selection, hidden)
             if isinstance(detector, PointDetector):
                 keypoints = detector.describe(rgb, keypoints)

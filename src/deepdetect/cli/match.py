@@ -337,6 +337,7 @@ def register(
         "matches": found.matches,
         "overlap": round(float(found.valid.mean()), 4),
         "correlation": round(found.zncc, 4),
+        "left_out": round(found.left_out, 4),
         "files": [*files.values()],
     }
     title = f"{image1.name} registered to {image0.name} by {found.matches:,} matches"

@@ -163,6 +163,7 @@ def pose(first: Path, second: Path, /, **values: Any) -> cli.Result:
         "angle_deg": found.angle,
         "matches": len(found.inliers),
         "inliers": int(found.inliers.sum()),
+        "left_out": round(found.left_out, 4),
     }
     rows = {f"R, row {k}": row for k, row in enumerate(numbers["R"], 1)}
     agree = f"{numbers['inliers']:,} of {numbers['matches']:,} matches agree"

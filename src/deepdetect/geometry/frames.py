@@ -8,9 +8,9 @@ from .._shared.machine import one_opencv_thread
 from .._shared.opencv import cv2
 
 MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
-MIN_SMOOTH_SHARE = 0.7
+MIN_SMOOTH_SHARE = 0.75
 """Pixels of a frame differ from its colour by at most this number of grey levels in each channel,
-about what JPEG leaves; the first share of the outermost pixels has exactly this colour. Each part
+about what JPEG leaves; the first share of the outermost pixels is exactly equal. Each part
 covers the second share of the image, one row of 500. The scene covers the third share; a video in
 portrait format covers 0.32 of one in landscape format. The scene, or each part of the frame,
 reaches `MIN_SMOOTH_SHARE` of the outline of its convex hull, up to `FRAME_MARGIN_PX`: a scene may
@@ -32,6 +32,8 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     if counts.max() < MIN_RING_SHARE * len(ring):
         return np.zeros(rgb.shape[:2], bool)
     colour = (values[counts.argmax()] >> np.array([16, 8, 0]) & 255).astype(np.float64)
+    near = (np.abs(ring - colour) <= MAX_FRAME_NOISE).all(axis=1)
+    colour = np.median(ring[near], axis=0)
     with one_opencv_thread():  # OpenCV would start more than OMP_NUM_THREADS allows
         return _frame_of_colour(rgb, colour)
 
@@ -43,19 +45,17 @@ def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     areas = stats[:, cv2.CC_STAT_AREA]
     parts = [k for k in border if k and areas[k] >= MIN_FRAME_SHARE * flat.size]
-    near = MAX_FRAME_NOISE // 4
-    close = np.bincount(
-        labels[cv2.inRange(rgb, colour - near, colour + near) > 0], minlength=len(areas)
-    )
-    # Most of a frame is much closer to its colour than JPEG may leave it, unlike textured blobs.
-    if 2 * close[parts].sum() < areas[parts].sum():
-        return nowhere
     scene = cv2.morphologyEx(
         (~np.isin(labels, parts)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3))
     )
     hull, smooth = _convex_hull(scene)
     frame = ~hull
     if not (smooth and frame.any()):
+        near = MAX_FRAME_NOISE // 4
+        close = cv2.inRange(rgb, colour - near, colour + near) > 0
+        # Most of the parts is much closer to the colour than JPEG may leave it, unlike texture.
+        if 2 * np.count_nonzero(close & np.isin(labels, parts)) < areas[parts].sum():
+            return nowhere
         frame = np.isin(
             labels, [k for k in parts if _convex_hull((labels == k).astype(np.uint8))[1]]
         )

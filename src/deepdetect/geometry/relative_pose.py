@@ -124,6 +124,7 @@ class RelativePose:
         inliers: (M,) bool, True for matches with an error below the threshold.
         errors: (M,) float64 Sampson distances of all matches in pixels.
         cheirality_ratio: fraction of the inliers that lie in front of both cameras, in [0, 1].
+        left_out: share of the image that `estimate_pose` left out, because it stands still.
     """
 
     rotation: np.ndarray
@@ -131,6 +132,7 @@ class RelativePose:
     inliers: np.ndarray
     errors: np.ndarray
     cheirality_ratio: float
+    left_out: float = 0.0
 
     @property
     def angle(self) -> float:

@@ -1,8 +1,8 @@
 """Find what stands still over images whose scene moves: frames, captions, logos, the own bonnet.
 
 Places that look the same at the same pixels would fit a scene without motion. They are an overlay
-only if the sparse matches that move agree on one geometry, fill more of the image than the still
-ones, and move clearly all around the still places.
+if all matches around them move clearly, as one scene that fills more of the image, and they do not
+shift together by a fraction of a pixel, as far parts of a scene do.
 """
 
 from __future__ import annotations
@@ -25,27 +25,32 @@ COMPARED_SIDE_PX = 640
 """Images are reduced to this longer side before they are compared: captions stay legible in it. All
 lengths below are in pixels of the reduced images."""
 
-STILL_WINDOW_PX, MAX_DIFFERENCE, MIN_GRADIENTS = 7, 0.3, 32.0
-"""A place may stand still if, in a window of this side, the difference of the gradients of two
-images is below the second value times the sum of both, and this sum is above the third: 2 grey
+WINDOW_PX, MAX_DIFFERENCE, MIN_GRADIENTS = 7, 0.3, 32.0
+"""A place looks the same in two images if, in a window of this side, the difference of their
+gradients is below the second value times the sum of both, and this sum is above the third: 2 grey
 levels per pixel in each image, as Sobel's filter scales them."""
 
-MAX_CORNERS, MIN_QUALITY, MIN_ROUNDNESS, MIN_STILL_CORNERS = 1000, 0.02, 0.2, 4
-"""A still place counts at up to this number of corners with this quality, as OpenCV defines it, and
-this ratio of the eigenvalues, because an edge that moves along itself looks still. Fewer corners of
-a region than the last value may be chance."""
+MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 0.75, 3.0, 8
+"""A match stands still if it moves by less than the first value, about the error of a keypoint. The
+scene clearly moves at a place if this number of its nearest moving matches move by more than the
+second. At the end of a street, which hardly moves for a camera that drives along it, few do."""
 
-MAX_STILL_PX, MIN_MOTION_PX = 0.75, 3.0
-"""A sparse match stands still if it moves by less than the first value, about the error of a
-keypoint. The scene clearly moves where matches move by more than the second."""
+MIN_AREA_PX, MIN_CLEAR_SHARE = 128, 0.67
+"""A still region is an overlay if the scene clearly moves at this share of its pixels, and if this
+number of pixels do not look the same where the scene moves to: half a word of a caption."""
 
-CELL_PX = 16
-"""Still corners and moving matches are counted by the square cells of this side that hold some."""
+MAX_SHIFT_PX, MIN_UNITY, MIN_ROUNDNESS = 0.15, 0.6, 0.5
+"""Far parts of a scene, unlike overlays, shift as a whole: by more than the first value, and by
+more than the second times the median shift of their windows; where text covers a scene, windows
+differ. The shift of a window is known if its structure tensor has the last ratio of determinant to
+squared half trace, because an edge that moves along itself looks still."""
 
-NEIGHBOURS, MIN_CLEAR_SHARE = 8, 0.67
-"""A still corner contradicts the scene if this number of its nearest moving matches all move
-clearly. A still region is an overlay if this share of its corners contradicts the scene. At
-the end of a street, which hardly moves for a camera that drives along it, few do."""
+CELL_PX = 32
+"""The motion of the scene is interpolated between squares of this side, and matches are counted by
+those that hold some."""
+
+SOBEL_GAIN = 8
+"""Sobel's filter of side 3 returns this number of times the gradient."""
 
 MIN_COMMON = 0.95
 """The frames of two images stand still if they have this share of their union in common."""
@@ -99,62 +104,97 @@ def find_overlay(grays: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:
         return np.zeros(grays[0].shape, bool)
     small = [downscale(gray, COMPARED_SIDE_PX)[0] for gray in grays]
     pairs = [*itertools.pairwise(small)]
-    still = np.all([_still(*pair) for pair in (*pairs, (small[0], small[-1]))], axis=0)
+    still = np.all([_same(*pair) for pair in (*pairs, (small[0], small[-1]))], axis=0)
     found = np.zeros(still.shape, bool)
-    for pair in pairs if np.count_nonzero(still) >= CELL_PX**2 else ():
+    for pair in pairs if np.count_nonzero(still) >= MIN_AREA_PX else ():
         found |= _contradicted(still, pair, seed)
     size = grays[0].shape[::-1]
     whole = cv2.resize(np.uint8(found), size, interpolation=cv2.INTER_NEAREST)
     return widened(whole, FRAME_MARGIN_PX)
 
 
-def _still(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _gradients(gray: np.ndarray) -> np.ndarray:
+    blurred = gaussian_blur(gray, BLUR_SIGMA_PX)
+    return np.dstack([cv2.Sobel(blurred, -1, *order) for order in ((1, 0), (0, 1))])
+
+
+def _same(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return where two images have the same gradients, (H, W) bool."""
-    (x0, y0), (x1, y1) = (
-        [cv2.Sobel(gaussian_blur(gray, BLUR_SIGMA_PX), -1, *order) for order in ((1, 0), (0, 1))]
-        for gray in (first, second)
-    )
+    one, other = _gradients(first), _gradients(second)
     difference, both = (
-        cv2.boxFilter(lengths, -1, (STILL_WINDOW_PX, STILL_WINDOW_PX))
-        for lengths in (np.hypot(x1 - x0, y1 - y0), np.hypot(x0, y0) + np.hypot(x1, y1))
+        cv2.boxFilter(lengths, -1, (WINDOW_PX, WINDOW_PX))
+        for lengths in (
+            np.linalg.norm(one - other, axis=2),
+            np.linalg.norm(one, axis=2) + np.linalg.norm(other, axis=2),
+        )
     )
     return np.asarray((difference < MAX_DIFFERENCE * both) & (both > MIN_GRADIENTS))
 
 
 def _contradicted(still: np.ndarray, pair: Pair, seed: int) -> np.ndarray:
     """Return the regions of still places that the motion between two reduced images contradicts."""
-    _, labels = cv2.connectedComponents(np.uint8(widened(still, CELL_PX // 2)))
-    eigen = cv2.cornerEigenValsAndVecs(gaussian_blur(pair[0], BLUR_SIGMA_PX), STILL_WINDOW_PX, 3)
-    round_ = still & (eigen[..., :2].min(axis=2) > MIN_ROUNDNESS * eigen[..., :2].max(axis=2))
-    corners = cv2.goodFeaturesToTrack(
-        pair[0], MAX_CORNERS, MIN_QUALITY, STILL_WINDOW_PX, mask=np.uint8(round_)
-    )
-    standing = np.empty((0, 2)) if corners is None else corners[:, 0].astype(np.float64)
-    regions = np.bincount(
-        labels[tuple(np.rint(standing.T[::-1]).astype(int))], minlength=labels.max() + 1
-    )
-    if regions[1:].max(initial=0) < MIN_STILL_CORNERS:  # before the matching, which takes longest
+    size = still.shape[::-1]
+    _, labels = cv2.connectedComponents(np.uint8(widened(still, FRAME_MARGIN_PX)))
+    shift, known = _shifts(*pair)
+
+    def stands(places: np.ndarray) -> np.ndarray:
+        overlay = np.bincount(labels[places], minlength=labels.max() + 1) >= MIN_AREA_PX
+        for label in np.flatnonzero(overlay):
+            shifts = shift[places & (labels == label)]
+            whole = np.linalg.norm(np.median(shifts, axis=0))
+            each = np.median(np.linalg.norm(shifts, axis=1))
+            overlay[label] = whole < max(MAX_SHIFT_PX, MIN_UNITY * each)
+        return overlay
+
+    if not stands(still & known).any():  # before the matching, which takes longest
         return np.zeros(still.shape, bool)
-    tentative, size = find_tentative_matches(*pair), still.shape[::-1]
-    motion = np.linalg.norm(tentative.points1 - tentative.points0, axis=1)
-    moves = motion > MAX_STILL_PX
-    scene, ends = tentative.points0[moves], tentative.points1[moves]
-    model = choose_model(scene, ends, (size, size), "auto", seed, semi_calibrated=False)
-    scene, motion = scene[model.inliers], motion[moves][model.inliers]
-    if not model.trusted or min(len(standing) - MIN_STILL_CORNERS, len(scene) - NEIGHBOURS) < 0:
-        return np.zeros(still.shape, bool)
-    gaps = np.linalg.norm(standing[:, None] - scene[None], axis=2)
-    nearest = np.argpartition(gaps, NEIGHBOURS - 1, axis=1)[:, :NEIGHBOURS]
-    clear = standing[motion[nearest].min(axis=1) > MIN_MOTION_PX]
-    stands, contradicts, moving = (
-        np.bincount(labels[tuple(np.rint(xy.T[::-1]).astype(int))], minlength=labels.max() + 1)
-        for xy in (standing, clear, scene[still[tuple(np.rint(scene.T[::-1]).astype(int))]])
-    )
-    # A region of mostly moving matches is an edge along the motion, which only looks still.
-    overlay = contradicts >= np.maximum(
-        np.maximum(MIN_CLEAR_SHARE * stands, moving), MIN_STILL_CORNERS
-    )
-    overlay[0] = False
-    # If more of the image stands still than moves, something moves before a still camera.
+    tentative = find_tentative_matches(*pair)
+    motion = tentative.points1 - tentative.points0
+    moves = np.linalg.norm(motion, axis=1) > MAX_STILL_PX
+    standing, scene, motion = tentative.points0[~moves], tentative.points0[moves], motion[moves]
+    model = choose_model(scene, scene + motion, (size, size), "auto", seed, semi_calibrated=False)
+    exactly = still & known & (np.linalg.norm(shift, axis=2) < MAX_SHIFT_PX)
+    column, row = np.rint(scene).astype(int).T
+    tells = model.inliers & ~exactly[row, column]  # a keypoint that moves there is inexact
+    scene, motion = scene[tells], motion[tells]
     cells, moving_cells = (len(np.unique(xy // CELL_PX, axis=0)) for xy in (standing, scene))
-    return np.asarray(overlay[labels] & (cells <= moving_cells))
+    # If more of the image stands still than moves, something moves before a still camera.
+    if not model.trusted or len(scene) < NEIGHBOURS or cells > moving_cells:
+        return np.zeros(still.shape, bool)
+    flow, least = _motion_of_scene(scene, motion, size)
+    ends = np.float32(np.dstack(np.meshgrid(*map(np.arange, size)))) + flow
+    moved = cv2.remap(pair[1], ends, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    clear = still & (least > MIN_MOTION_PX)
+    shown = clear & known & ~_same(pair[0], moved)
+    still_px, clear_px = (
+        np.bincount(labels[where], minlength=labels.max() + 1) for where in (still, clear)
+    )
+    return (stands(shown) & (clear_px >= MIN_CLEAR_SHARE * still_px))[labels]
+
+
+def _shifts(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shift (H, W, 2) of the window around each pixel, and where it is known."""
+    x, y = np.moveaxis(_gradients(first) + _gradients(second), 2, 0) / (2 * SOBEL_GAIN)
+    step = gaussian_blur(first, BLUR_SIGMA_PX) - gaussian_blur(second, BLUR_SIGMA_PX)
+    xx, xy, yy, xt, yt = (
+        cv2.boxFilter(product, -1, (WINDOW_PX, WINDOW_PX))
+        for product in (x * x, x * y, y * y, x * step, y * step)
+    )
+    determinant = np.maximum(xx * yy - xy * xy, 1e-9)
+    shift = np.dstack([yy * xt - xy * yt, xx * yt - xy * xt]) / determinant[..., None]
+    return shift, 4 * determinant > MIN_ROUNDNESS * (xx + yy) ** 2
+
+
+def _motion_of_scene(
+    scene: np.ndarray, motion: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Interpolate the median motion (H, W, 2) and the least (H, W) of the nearest matches."""
+    columns, rows = (np.arange(CELL_PX // 2, side + CELL_PX, CELL_PX) for side in size)
+    gaps = np.linalg.norm(np.dstack(np.meshgrid(columns, rows))[..., None, :] - scene, axis=-1)
+    nearest = motion[np.argpartition(gaps, NEIGHBOURS - 1)[..., :NEIGHBOURS]]
+    cells = np.median(nearest, axis=2), np.linalg.norm(nearest, axis=-1).min(axis=-1)
+    flow, least = (
+        cv2.resize(np.float32(each), None, fx=CELL_PX, fy=CELL_PX)[: size[1], : size[0]]
+        for each in cells
+    )
+    return flow, least

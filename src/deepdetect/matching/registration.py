@@ -84,6 +84,7 @@ class Registration:
         applied: the images of `apply_to` warped into the frame, (H, W, C) with all their bands and
             in their own type. Where they have no content, they are 0, or their no-data value.
         value_range: the values of black and white in `warped`, if it is uint16.
+        left_out: share of the first image that was left out, because it stands still.
     """
 
     homography: np.ndarray
@@ -95,6 +96,7 @@ class Registration:
     origin: tuple[int, int] = (0, 0)
     applied: tuple[np.ndarray, ...] = ()
     value_range: ValueRange = (0, 65535)
+    left_out: float = 0.0
 
     def __repr__(self) -> str:
         height, width = self.valid.shape
@@ -189,7 +191,7 @@ def register(
         raise RegistrationError(
             "no homography can be trusted: both images must show a plane or be taken from one place"
         )
-    grays = scene_of((first[:, :, :3], second[:, :, :3]), (None, None), seed)[0]
+    grays, _, left_out = scene_of((first[:, :, :3], second[:, :, :3]), (None, None), seed)
     if not agree(*grays, homography):
         raise RegistrationError(
             "the images contradict the homography of their matches: warped, they are no more alike "
@@ -219,7 +221,7 @@ def register(
         no_data = read_metadata(each).no_data if is_file(each) else None
         seen = hidden if each is image1 else None
         applied.append(warp_bands(bands, moved, size, no_data, seen))
-    numbers = len(matches), zncc, (left, top), tuple(applied), values
+    numbers = len(matches), zncc, (left, top), tuple(applied), values, left_out
     return Registration(homography, first, warped, valid, *numbers)
 
 

@@ -115,7 +115,7 @@ def reconstruct(
     check_model("fundamental", seed, GeometryOptions())
     images = image0, image1
     rgb, masks, _, known = _load_pair(images, channels, calibration, focal_px, ignore)
-    grays, masks, _ = scene_of(rgb, masks, seed)
+    grays, masks, left_out = scene_of(rgb, masks, seed)
     timer = StageTimer(progress)
     tentative = rectification = None
     if rectified is None:
@@ -161,6 +161,7 @@ def reconstruct(
         rectification=rectification,
         calibration=known,
         seconds=timer.seconds,
+        left_out=left_out,
     )
 
 
@@ -224,7 +225,9 @@ def estimate_pose(
         )
     with timer.stage("sub-pixel"):
         corners = refined_corners(grays, matches.points0, matches.points1)
-    return checked_pose(*corners, known, seed, timer)
+    pose = checked_pose(*corners, known, seed, timer)
+    left_out = 0.0 if matches.geometry is None else matches.geometry.evidence.left_out
+    return replace(pose, left_out=left_out)
 
 
 def _from_disparities(

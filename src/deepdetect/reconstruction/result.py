@@ -54,6 +54,7 @@ class Reconstruction:
         matches: number of matches that were triangulated.
         dropped: number of matches that each check removed, in the order of the checks.
         seconds: time that each stage took.
+        left_out: share of the image that was left out, because it stands still.
     """
 
     points: np.ndarray
@@ -72,6 +73,7 @@ class Reconstruction:
     matches: int
     dropped: dict[str, int]
     seconds: dict[str, float]
+    left_out: float = 0.0
 
     def __len__(self) -> int:
         return len(self.points)
@@ -137,6 +139,7 @@ class Reconstruction:
             "keypoints": self.keypoints,
             "matches": self.matches,
             "dropped": dict(self.dropped),
+            "left_out": round(self.left_out, 4),
             "width": self.size[0],
             "height": self.size[1],
             "density": round(len(self) / (self.size[0] * self.size[1]), 6),

@@ -181,6 +181,7 @@ def _reconstruct(
             matched=verified,
             pairs=len(matches),
             pair_choice=options.pair_choice(len(sizes)),
+            left_out=stages.left_out,
             seconds=timer.seconds,
             files=output_files(target, options.formats)[:-1],
         )

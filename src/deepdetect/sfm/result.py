@@ -47,6 +47,7 @@ class MultiViewReconstruction:
         matched: number of verified matches, by pair.
         pairs: number of pairs that were matched.
         pair_choice: how the pairs were chosen, such as "exhaustive", "sequential:10" or "similar".
+        left_out: largest share of an image that was left out, because it stands still.
         seconds: time that each stage took in this run, about 0 if an earlier run had finished it.
         files: files and folders that were written.
     """
@@ -67,6 +68,7 @@ class MultiViewReconstruction:
     matched: Mapping[tuple[str, str], int]
     pairs: int
     pair_choice: str
+    left_out: float
     seconds: Mapping[str, float]
     files: tuple[Path, ...]
 
@@ -100,6 +102,7 @@ class MultiViewReconstruction:
             "keypoints": sum(self.keypoints.values()),
             "pairs": self.pairs,
             "pair_choice": self.pair_choice,
+            "left_out": round(self.left_out, 4),
             "verified_pairs": len(self.matched),
             "verified_matches": sum(self.matched.values()),
             "sparse_points": len(self.sparse),

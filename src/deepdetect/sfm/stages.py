@@ -43,7 +43,6 @@ from ..features.selection import SelectionOptions
 from ..geometry.camera import PosedView
 from ..io.image import find_images, load_image, luma, name_images
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
-from ..io.masks import load_mask, save_mask
 from ..io.projection import MIN_ASPECT, require_pinhole
 from ..matching.overlay import find_overlay, tell_still
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
@@ -77,9 +76,9 @@ LINKS = ".images"
 """Name of a folder inside `WORK` with links to the images, if the user gave a list of files. The
 folder is hidden, so that a search for images in a folder above does not find them twice."""
 
-
-COMPARED_IMAGES = 16
-"""An overlay is looked for in this number of images, the first by name. Chosen by hand."""
+COMPARED_RUNS = 8
+"""An overlay is looked for in this number of runs of three images, spread over all: images that
+follow each other by name are mostly of one camera. Chosen by hand."""
 
 
 @suggest_keywords
@@ -183,6 +182,7 @@ class Stages:
         self.options, self.workers, self.quiet, self.seed = options, workers, quiet, seed
         self.matching = PairMatchingOptions(seed=seed)
         self.features = self.work / "features.h5"
+        self.left_out = 0.0
 
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
         """Return a folder that holds all images, and no results.
@@ -208,20 +208,24 @@ class Stages:
                 shutil.copy2(path, folder / name)
         return folder
 
-    def find_overlay(self, paths: Sequence[Path]) -> np.ndarray | None:
-        """Return where the images show one overlay, or None; an earlier run's result stays."""
-        file = self.work / "overlay.png"
+    def find_overlays(self, paths: Sequence[Path]) -> list[np.ndarray]:
+        """Return where images of each size show an overlay; an earlier run's result stays."""
+        file = self.work / "overlays.npz"
         if not self.features.exists():
-            grays = []
-            for path in paths[:COMPARED_IMAGES]:
+            found: dict[str, np.ndarray] = {}
+            starts = np.linspace(0, max(0, len(paths) - MIN_VIEWS), COMPARED_RUNS).astype(int)
+            for start in sorted({*starts.tolist()}):
+                grays = []
                 with contextlib.suppress(ImageError):  # the extraction names it
-                    grays.append(luma(load_image(path)))
-            alike = [gray for gray in grays if gray.shape == grays[0].shape]
-            if len(alike) >= MIN_VIEWS and (found := find_overlay(alike, self.seed)).any():
-                save_mask(found, file)
-        overlay = load_mask(file) if file.exists() else None
-        tell_still(0.0 if overlay is None else float(overlay.mean()))
-        return overlay
+                    grays = [luma(load_image(path)) for path in paths[start : start + MIN_VIEWS]]
+                if len(grays) == MIN_VIEWS and (mask := find_overlay(grays, self.seed)).any():
+                    size = "{1}x{0}".format(*mask.shape)
+                    found[size] = found.get(size, False) | mask
+            save_arrays(file, found)
+        overlays = [*(load_arrays(file) or {}).values()]
+        self.left_out = max((float(overlay.mean()) for overlay in overlays), default=0.0)
+        tell_still(self.left_out)
+        return overlays
 
     def extract(
         self,
@@ -234,13 +238,13 @@ class Stages:
         Returns three mappings by image name: the sizes (width, height) and the numbers of keypoints
         of the images that could be read, and, for each other image, a sentence that says why not.
         """
-        overlay = self.find_overlay([folder / name for name in check_images(folder)])
+        overlays = self.find_overlays([folder / name for name in check_images(folder)])
         report = extract_features(
             folder,
             self.features,
             detector,
             selection=selection,
-            ignore=overlay,
+            ignore=overlays,
             workers=self.workers,
             quiet=self.quiet,
         )

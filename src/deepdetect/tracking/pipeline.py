@@ -31,8 +31,9 @@ MIN_SIDE_PX = 32
 """`max_side`, the longer side of scaled frames, must be at least this. Chosen by hand."""
 
 COMPARED_FRAMES, MAX_STEP = 8, 15
-"""An overlay is looked for in this number of frames before the tracking. They are at most the
-second number of frames apart, half a second of most videos, so that they show the same places."""
+"""An overlay is looked for in this number of frames, before the tracking or, of a camera, once they
+were seen. They are at most the second number of frames apart, half a second of most videos, so that
+they show the same places."""
 
 RATE_FRAMES = 10
 """The displayed frame rate is a mean over this number of frames."""
@@ -52,7 +53,7 @@ class TrackingReport:
         files: files that were written.
         expected: number of frames that the source states, or None. A truncated file has fewer.
         failures: a sentence on each frame of a folder that was left out.
-        left_out: share of the frames that was left out, because it stands still (not of a camera).
+        left_out: share of the frames that was left out, because it stands still.
     """
 
     frames: int
@@ -159,8 +160,10 @@ def track(
     with ExitStack() as stack:
         opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
         detect = point_candidates(options) if detector is None else detector.detect
-        overlay = None if opened.live else _find_overlay(source, every)
-        tracker = Tracker(detect, options, overlay)
+        tracker = Tracker(detect, options)
+        if not opened.live:
+            tracker.ignore = _told_overlay(_compared_frames(source, every))
+        seen: list[np.ndarray] = []
         stopped = stack.enter_context(_ended_by_signals(opened.live))
         write = stack.enter_context(write_tracks(table))
         draw = None if video is None else stack.enter_context(write_video(video, opened.fps))
@@ -169,6 +172,10 @@ def track(
         bar = stack.enter_context(progress(opened.count, "tracking", "frame", quiet))
         for rgb, frame in tracked:
             write(frame)
+            if opened.live and frames % MAX_STEP == 0 and len(seen) < COMPARED_FRAMES:
+                seen.append(luma(rgb))
+                if len(seen) == COMPARED_FRAMES:
+                    tracker.ignore = _told_overlay(seen)
             ticks.append(time.perf_counter())
             rate = (len(ticks) - 1) / max(1e-9, ticks[-1] - ticks[0])
             if draw is not None:
@@ -191,16 +198,21 @@ def track(
         tuple(path for path in (video, table) if path is not None),
         opened.count,
         tuple(opened.failures),
-        0.0 if overlay is None else float(overlay.mean()),
+        0.0 if tracker.ignore is None else float(tracker.ignore.mean()),
     )
 
 
-def _find_overlay(source: str | Path | int, every: int) -> np.ndarray | None:
-    """Return where the first frames of a file or folder show an overlay, or None."""
+def _compared_frames(source: str | Path | int, every: int) -> list[np.ndarray]:
+    """Return the first frames of a file or folder, in which an overlay is looked for, as luma."""
     with FrameSource(source) as whole:
         step = min(MAX_STEP, max(1, (whole.count or 0) // COMPARED_FRAMES))
     with FrameSource(source, every=step * every, max_frames=COMPARED_FRAMES) as some:
-        overlay = find_overlay([luma(frame.rgb) for frame in some])
+        return [luma(frame.rgb) for frame in some]
+
+
+def _told_overlay(grays: list[np.ndarray]) -> np.ndarray | None:
+    """Return where frames show an overlay, of which a warning tells, or None."""
+    overlay = find_overlay(grays)
     tell_still(float(overlay.mean()))
     return overlay if overlay.any() else None
 
