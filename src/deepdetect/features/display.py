@@ -39,10 +39,7 @@ def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.n
 
 
 def html_summary(
-    title: str,
-    rows: Mapping[str, str],
-    points: Sequence[Points],
-    lines: np.ndarray | None = None,
+    title: str, rows: Mapping[str, str], points: Sequence[Points], lines: np.ndarray | None = None
 ) -> str:
     """Return HTML of about 10 kB with a small table and a figure of the positions of keypoints.
 
@@ -77,5 +74,5 @@ def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.
             start, end = (round(x0), round(y0)), (round(x1) + widths[0], round(y1))
             cv2.line(
                 picture, start, end, (90, 220, 255)
-            )  # antialiased lines would make the PNG 5 times larger
+            )  # antialiased, the PNG has 5 times the size
     return picture

@@ -58,10 +58,7 @@ class PagePoints:
 
 
 def write_html_page(
-    cloud: PointCloud,
-    path: Path,
-    metadata: Mapping[str, str],
-    cameras: Sequence[PosedView] = (),
+    cloud: PointCloud, path: Path, metadata: Mapping[str, str], cameras: Sequence[PosedView] = ()
 ) -> None:
     """Write the page: 12 bytes per point, as 16-bit positions and 8-bit colours in base64.
 

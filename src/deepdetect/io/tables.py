@@ -11,13 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import (
-    ImageError,
-    InvalidFileError,
-    MissingFileError,
-    OptionError,
-    first_line,
-)
+from .._shared.errors import ImageError, InvalidFileError, MissingFileError, OptionError, first_line
 from .._shared.options import suggest_keywords
 from .._shared.records import save_arrays
 from ..features.keypoints import Keypoints
@@ -26,10 +20,7 @@ from ..features.matches import Evidence, Matches, TwoViewGeometry
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
 """These attributes of keypoints may be None. An npz file contains those that are not."""
 
-MATCH_VALUES = (
-    *("points0", "points1", "scores", "inliers"),
-    *("subpixel", "indices0", "indices1"),
-)
+MATCH_VALUES = (*("points0", "points1", "scores", "inliers"), *("subpixel", "indices0", "indices1"))
 """An npz file contains these attributes of `Matches`, in addition to keypoints and geometry."""
 
 CSV_ROWS = 100_000

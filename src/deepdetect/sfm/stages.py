@@ -136,11 +136,7 @@ class MultiViewOptions:
         check_name("mapper", self.mapper, ("incremental", "global"))
         if "mesh" in self.formats and not self.dense:
             raise OptionError("the format 'mesh' needs dense points: leave out `dense=False`")
-        check_ranges(
-            self,
-            counts=("stride_px",),
-            fractions=("min_motion",),
-        )
+        check_ranges(self, counts=("stride_px",), fractions=("min_motion",))
 
     def pair_choice(self, count: int) -> str:
         """Return the choice of the pairs of `count` images, with "auto" replaced by its meaning."""

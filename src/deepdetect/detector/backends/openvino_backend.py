@@ -12,13 +12,7 @@ import numpy as np
 from ..._shared.errors import OptionError
 from ..._shared.runtimes import import_openvino
 from ..pretrained import LOGITS, PADDED_IMAGE, POINTS
-from .interface import (
-    RuntimeOptions,
-    as_logits,
-    failed_run,
-    output_to_read,
-    unreadable,
-)
+from .interface import RuntimeOptions, as_logits, failed_run, output_to_read, unreadable
 
 COMPILED_LAYERS = 100
 """OpenVINO compiles layers for each image size, and caches at most this many. Its default, 5000,

@@ -100,8 +100,7 @@ class DisparityOptions:
                 f"not {whole}"
             )
         check_ranges(
-            self,
-            between={"uniqueness_ratio": (1, math.inf), "discontinuity_margin_px": (0, 100)},
+            self, between={"uniqueness_ratio": (1, math.inf), "discontinuity_margin_px": (0, 100)}
         )
 
 
