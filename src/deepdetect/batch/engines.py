@@ -59,7 +59,13 @@ def map_on_ray(
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")
-    ray = _import_ray()
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
+    require_packages("the engine ray", "ray")
+    import ray
+    import ray.data
+    import ray.exceptions
+
     if not len(tasks):
         return
     # Ray prints messages about its workers to standard output, which is for results.
@@ -101,17 +107,6 @@ class _Worker:
         except DeepDetectError as error:  # if raised, Ray would add a traceback
             outcome = error
         return {"outcome": pickle.dumps(outcome)}
-
-
-def _import_ray() -> Any:
-    for name, value in SETTINGS.items():
-        os.environ.setdefault(name, value)
-    require_packages("the engine ray", "ray")
-    import ray
-    import ray.data
-    import ray.exceptions
-
-    return ray
 
 
 def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:

@@ -118,14 +118,8 @@ def extract_features(
         path,
         settings,
         {name: {name: file_state(root / name)} for name in utf8},
-        partial(
-            _extract,
-            root=root,
-            selection=selection,
-            ignore=ignore,
-            detector=detector,
-            reading=reading,  # other processes do not inherit these options
-        ),
+        # Other processes do not inherit the reading options.
+        partial(_extract, root, detector, selection, ignore, reading),
         of="images",
         others_stay=lambda _: False,
         engine=engine,
@@ -138,14 +132,14 @@ def extract_features(
 
 
 def _extract(
-    images: Sequence[Item],
-    counts: dict[str, int],
-    failures: list[str],
     root: Path,
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
     ignore: np.ndarray | None,
     reading: ReadingOptions,
+    images: Sequence[Item],
+    counts: dict[str, int],
+    failures: list[str],
 ) -> Iterator[Group]:
     for name, state in images:
         with noted_failures(name, failures):
@@ -200,16 +194,7 @@ def read_keypoints(file: Any, name: str) -> Keypoints:
     try:
         settings = json.loads(file.attrs.get(SETTINGS, "{}"))
         return _keypoints_of(file[name], settings.get("descriptor"))
-    # For damaged files, h5py raises any of these; a wrong shape can need too much memory.
-    except (
-        OSError,
-        RuntimeError,
-        LookupError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        MemoryError,
-    ) as error:
+    except Exception as error:  # h5py and NumPy raise many types of errors for damaged files
         raise damaged(Path(f"{file.filename}, {name}"), error) from error
 
 
