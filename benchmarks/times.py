@@ -25,7 +25,6 @@ import cv2
 import numpy as np
 
 from deepdetect import DeepDetect, PointDetector, SelectionOptions
-from deepdetect._shared.opencv import opencv_factory
 from deepdetect.io.image import load_image, luma
 from deepdetect_lab.datasets.planar import load_oxford
 from deepdetect_lab.evaluation.baselines.external import onnx_feature
@@ -42,6 +41,7 @@ from deepdetect_lab.evaluation.protocols.planar import pairs_of
 from deepdetect_lab.evaluation.protocols.standard import MATCHING_BUDGET, pair_row
 from deepdetect_lab.evaluation.report import Row, Table, mean, where
 from deepdetect_lab.evaluation.run import Run
+from deepdetect_lab.labels.factories import opencv_factory
 
 SIZE_PX = (800, 600)
 ROUNDS = 15

@@ -41,19 +41,3 @@ def test_none_too_old_and_an_empty_folder_that_another_package_left(monkeypatch)
     put(monkeypatch)
     with pytest.raises(MissingExtraError):
         assert opencv.cv2.resize
-
-
-@pytest.mark.parametrize("home", ["main", "xfeatures2d"])
-def test_factories_of_both_places(monkeypatch: pytest.MonkeyPatch, home: str) -> None:
-    contrib = ModuleType("xfeatures2d")
-    put(monkeypatch, __version__="5.0.0", xfeatures2d=contrib)
-    place = sys.modules["cv2"] if home == "main" else contrib
-    place.BRISK_create = len
-    assert opencv.opencv_factory("BRISK_create") is len
-
-
-def test_factories_of_contrib_modules_that_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    put(monkeypatch, __version__="5.0.0")
-    monkeypatch.setattr(opencv, "installed_distributions", lambda: ["opencv-python"])
-    with pytest.raises(MissingExtraError, match="AGAST"):
-        opencv.opencv_factory("AgastFeatureDetector_create")

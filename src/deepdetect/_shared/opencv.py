@@ -10,7 +10,6 @@ import functools
 import importlib
 import re
 import sys
-from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -84,25 +83,6 @@ def is_lack_of_memory(error: Exception) -> bool:
     loaded = sys.modules.get("cv2")
     wanted = loaded is not None and isinstance(error, loaded.error)
     return wanted and getattr(error, "code", None) == cv2.Error.StsNoMem
-
-
-def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
-    """Return a factory function of OpenCV, such as "AgastFeatureDetector_create".
-
-    OpenCV 5 has some factories in a contrib module, `cv2.xfeatures2d`. Raises a MissingExtraError
-    if the contrib modules are needed but not installed.
-    """
-    for home in (cv2, getattr(cv2, "xfeatures2d", None)):
-        if hasattr(home, name):
-            factory: Callable[..., cv2.Feature2D] = getattr(home, name)
-            return factory
-    short = name.removesuffix("_create").removesuffix("FeatureDetector").upper()
-    headless = "opencv-python" not in installed_distributions()
-    raise MissingExtraError(
-        f"{short} needs OpenCV's contrib modules, which the installed OpenCV {cv2.__version__} "
-        "lacks: run pip install --force-reinstall --no-deps opencv-contrib-python"
-        + ("-headless" if headless else "")
-    )
 
 
 def installed_distributions() -> list[str]:

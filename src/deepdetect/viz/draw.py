@@ -39,9 +39,6 @@ CAPTION_SCALE = 0.5
 """Height and side margin of a caption, in pixels, and its font scale in OpenCV, for images up to
 `READABLE_WIDTH_PX` wide. Chosen by hand so that captions are legible."""
 
-GAP_PX = 6
-"""Joined images are separated by gaps of this width, in pixels. Chosen by hand."""
-
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
 
@@ -233,15 +230,3 @@ def _caption(text: str, width: int, unit: float) -> np.ndarray:
     scale *= min(1.0, room / max(long, 1))
     cv2.putText(strip, text, place, font, scale, WHITE, thickness, cv2.LINE_AA)
     return strip
-
-
-def join_pictures(panels: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Join images of one size in a grid of `columns` columns, with white gaps."""
-    height, width = panels[0].shape[:2]
-    rows = -(-len(panels) // columns)
-    size = rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3
-    joined = np.full(size, 255, np.uint8)
-    for k, panel in enumerate(panels):
-        top, left = k // columns * (height + GAP_PX), k % columns * (width + GAP_PX)
-        joined[top : top + height, left : left + width] = panel
-    return joined

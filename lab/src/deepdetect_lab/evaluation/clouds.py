@@ -11,7 +11,9 @@ from matplotlib.figure import Figure
 
 from deepdetect._shared.opencv import cv2
 from deepdetect.geometry.point_cloud import PointCloud, robust_box
-from deepdetect.viz.draw import add_caption, join_pictures
+from deepdetect.viz.draw import add_caption
+
+from ..labels.fusion import join_pictures
 
 DPI = 100
 """Pixels per inch of the figure. It is needed because matplotlib takes sizes in inches."""

@@ -16,7 +16,9 @@ from typing import Any, Literal
 import numpy as np
 
 from deepdetect._shared.errors import OptionError, unknown_name
-from deepdetect._shared.opencv import cv2, opencv_factory
+from deepdetect._shared.opencv import cv2
+
+from .factories import opencv_factory
 
 Value = bool | int | float
 Settings = Mapping[str, Any]

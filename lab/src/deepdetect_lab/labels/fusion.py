@@ -6,6 +6,7 @@ PNG file.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,10 +21,13 @@ from deepdetect._shared.records import Outputs
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import save_mask
 from deepdetect.io.picture_file import save_picture
-from deepdetect.viz.draw import add_caption, join_pictures
+from deepdetect.viz.draw import add_caption
 
 from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
+
+GAP_PX = 6
+"""Joined images are separated by gaps of this width, in pixels. Chosen by hand."""
 
 LOW_VISIBILITY_RANGE = 64
 """An image has low visibility if its luma spans fewer grey levels; `visibility_of` says why."""
@@ -163,3 +167,15 @@ def label_file(task: LabelTask) -> dict[str, Any] | str:
         save_mask(label.mask, task.mask)
     files = {"image": task.image, "mask": task.mask}
     return {**files, "visibility": label.visibility, "density": label.density}
+
+
+def join_pictures(panels: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Join images of one size in a grid of `columns` columns, with white gaps."""
+    height, width = panels[0].shape[:2]
+    rows = -(-len(panels) // columns)
+    size = rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3
+    joined = np.full(size, 255, np.uint8)
+    for k, panel in enumerate(panels):
+        top, left = k // columns * (height + GAP_PX), k % columns * (width + GAP_PX)
+        joined[top : top + height, left : left + width] = panel
+    return joined

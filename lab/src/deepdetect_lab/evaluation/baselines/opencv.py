@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from deepdetect._shared.opencv import cv2, opencv_factory
+from deepdetect._shared.opencv import cv2
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.io.image import luma
 
+from ...labels.factories import opencv_factory
 from .method import LocalFeature, OwnScaleDescriptor
 
 MAX_CORNERS = 1_000_000

@@ -13,10 +13,11 @@ from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import load_mask
-from deepdetect.viz.draw import add_caption, draw_matches, join_pictures
+from deepdetect.viz.draw import add_caption, draw_matches
 
 from ...datasets.foreground import MaskedPhotograph, load_foreground
 from ...datasets.planar import PlanarPair, PlanarScene
+from ...labels.fusion import join_pictures
 from ..baselines.method import LocalFeature
 from ..metrics.repeatability import foreground_fraction, repeatability_paper
 from ..options import BenchmarkOptions
