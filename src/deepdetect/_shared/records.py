@@ -144,7 +144,9 @@ class Outputs:
             return None
         records = [self._known(path) for path in self.paths]
         for path, record in zip(self.paths, records, strict=True):
-            if record and record["digest"] and not _is_unchanged(path, record):
+            if not record or not record["digest"] or list(file_state(path)) == record["state"]:
+                continue
+            if file_digest(path) != record["digest"]:  # copied files only have other times
                 raise OptionError(f"{path} exists, and was changed after it was made: {ADVICE}")
         states = [list(file_state(path)) for path in self.inputs]
         done = all(record and record["whole"] and record["states"] == states for record in records)
@@ -220,12 +222,11 @@ def _record(output: Path) -> Path:
 
 def _read(output: Path) -> dict[str, Any] | None:
     """Read the record of an output; return None if the record is missing or damaged."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         record = json.loads(_record(output).read_bytes())
-    except (OSError, ValueError):
-        return None
-    fields = {"inputs", "states", "settings", "values", "whole", "state", "digest"}
-    return record if isinstance(record, dict) and fields <= {*record} else None
+        fields = {"inputs", "states", "settings", "values", "whole", "state", "digest"}
+        return record if isinstance(record, dict) and fields <= {*record} else None
+    return None
 
 
 def _restore(record: Path, content: bytes | None) -> None:
@@ -235,11 +236,6 @@ def _restore(record: Path, content: bytes | None) -> None:
         else:
             with atomic_path(record) as temporary:
                 temporary.write_bytes(content)
-
-
-def _is_unchanged(path: Path, record: Mapping[str, Any]) -> bool:
-    # In a copied folder, files have other times but the same digests.
-    return list(file_state(path)) == record["state"] or file_digest(path) == record["digest"]
 
 
 def inputs_of(path: Path) -> list[str]:
