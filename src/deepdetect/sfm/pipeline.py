@@ -21,7 +21,7 @@ from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.selection import SelectionOptions
-from ..geometry.camera import Calibration, Camera, PosedView, check_camera_file
+from ..geometry.camera import Calibration, Camera, check_camera_file
 from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
@@ -41,11 +41,9 @@ from .result import MultiViewReconstruction
 from .splat import write_transforms
 from .stages import WORK, MultiViewOptions, Stages, check_images
 
-MAX_KEYPOINTS = 8192
-"""An image gets at most this number of keypoints by default. Chosen by hand."""
-
-MIN_KEYPOINTS = 15
-"""Images with fewer keypoints are left out, because they cannot be matched. Chosen by hand."""
+MIN_KEYPOINTS, MAX_KEYPOINTS = 15, 8192
+"""Images with fewer keypoints are left out, because they cannot be matched. By default, an image
+gets at most the second number. Chosen by hand."""
 
 
 @suggest_keywords
@@ -143,12 +141,13 @@ def reconstruct_many(
             dense["points"] = place.similarity.apply(dense["points"])
             dense["normals"] = dense["normals"] @ place.similarity.rotation.T
         views = dict(sorted(sparse.views.items()))
+        left = (tuple(sorted(names & unregistered.keys())) for names in components)
         found = MultiViewReconstruction(
             georeference=place,
             views=views,
             intrinsics={name: sparse.images[name].intrinsics for name in views},
             unregistered=dict(sorted(unregistered.items())),
-            components=_without_registered(components, unregistered),
+            components=(*sorted((n for n in left if len(n) > 1), key=len, reverse=True),),
             reference=reference,
             sparse=PointCloud(sparse.points, sparse.colors, *unit),
             sparse_errors=sparse.errors.astype(np.float32),
@@ -253,17 +252,16 @@ def _write(
     }
     save_point_cloud(found.cloud, output / "model.ply", notes)
     save_point_cloud(found.cloud, output / "model.glb", notes)
+    # The page shows the points and cameras in the frame of the reference.
+    view, cloud = found.views[found.reference], found.cloud
+    points = cloud.points @ view.rotation.T + view.translation
+    page = PointCloud(points, cloud.colors, cloud.unit, f"camera of {view.name}")
+    cameras = [each.relative_to(view) for each in found.views.values()]
     with atomic_path(output / "model.html") as path:
-        page, cameras = _seen_from(found.views[found.reference], found)
         write_html_page(page, path, notes, cameras)
     images = {name: (folder / name).resolve() for name in found.views}
-    write_transforms(
-        output / "transforms.json",
-        found.views,
-        found.intrinsics,
-        {"file_path": images},
-        output / "model.ply",
-    )
+    cameras_of = found.views, found.intrinsics, {"file_path": images}
+    write_transforms(output / "transforms.json", *cameras_of, output / "model.ply")
     values = {**found.summary(), "files": [str(path) for path in found.files]}
     with atomic_path(output / "model.json") as path:
         path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
@@ -275,16 +273,6 @@ def _write(
             failed.append(str(error))
     if failed:
         raise ReconstructionError("; ".join(failed) + " (all other files were written)")
-
-
-def _seen_from(
-    view: PosedView, found: MultiViewReconstruction
-) -> tuple[PointCloud, list[PosedView]]:
-    """Return the points and cameras, in the frame of the camera `view`, for the HTML viewer."""
-    frame = f"camera of {view.name}"
-    points = found.cloud.points @ view.rotation.T + view.translation
-    cameras = [each.relative_to(view) for each in found.views.values()]
-    return PointCloud(points, found.cloud.colors, found.cloud.unit, frame), cameras
 
 
 def _why_unregistered(
@@ -303,11 +291,3 @@ def _why_unregistered(
             "in between"
         )
     return "it matches no other image: it shows something else, or was taken from too far away"
-
-
-def _without_registered(
-    components: Iterable[frozenset[str]], unregistered: Iterable[str]
-) -> tuple[tuple[str, ...], ...]:
-    """Return the unregistered images in each component, if two or more, largest component first."""
-    left = [tuple(sorted(names & frozenset(unregistered))) for names in components]
-    return tuple(sorted((names for names in left if len(names) > 1), key=len, reverse=True))
