@@ -178,7 +178,11 @@ class Outputs:
         except BaseException:
             for path, record, (state, content) in zip(self.paths, records, before, strict=True):
                 if file_state(path) == state:
-                    _restore(record, content)
+                    with contextlib.suppress(OSError, DeepDetectError):
+                        if content is None:
+                            record.unlink()
+                        else:
+                            _write(record, content)
             for folder in sorted(missing, reverse=True):  # inner folders first
                 with contextlib.suppress(OSError):  # the folder is not empty
                     folder.rmdir()
@@ -212,8 +216,7 @@ class Outputs:
             whole = done and path.exists()
             digest = file_digest(path) if whole and path.is_file() else None
             state = {"whole": whole, "state": file_state(path), "digest": digest}
-            with atomic_path(_record(path)) as temporary:
-                temporary.write_text(json.dumps(note | state), encoding="utf-8")
+            _write(_record(path), json.dumps(note | state).encode())
 
 
 def _record(output: Path) -> Path:
@@ -229,13 +232,9 @@ def _read(output: Path) -> dict[str, Any] | None:
     return None
 
 
-def _restore(record: Path, content: bytes | None) -> None:
-    with contextlib.suppress(OSError, DeepDetectError):
-        if content is None:
-            record.unlink()
-        else:
-            with atomic_path(record) as temporary:
-                temporary.write_bytes(content)
+def _write(record: Path, content: bytes) -> None:
+    with atomic_path(record) as temporary:
+        temporary.write_bytes(content)
 
 
 def inputs_of(path: Path) -> list[str]:

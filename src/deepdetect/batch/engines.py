@@ -31,8 +31,8 @@ MAX_BLOCKS = 4096
 """Tasks are divided into at most this many parts, because a part costs Ray some milliseconds."""
 
 PROCESSORS_PER_WORKER = 0.5
-"""Each worker reserves only this fraction of a processor in Ray. If half of the machines are lost,
-the others can therefore take over all workers, for which tasks would otherwise wait forever."""
+"""Each worker reserves only this fraction of a processor in Ray, so that half of the machines can
+take over all workers, for which tasks would otherwise wait forever."""
 
 OBJECT_STORE_BYTES = 200_000_000
 """Shared memory of a cluster that this module starts: little, because results go to files."""
@@ -110,14 +110,9 @@ class _Worker:
 
 
 def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
+    options = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES, **quiet}
     try:
-        ray.init(
-            address="local",
-            num_cpus=processors,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            **quiet,
-        )
+        ray.init(address="local", num_cpus=processors, **options)
     except Exception as error:  # Ray raises errors of many types, after half a minute
         ray.shutdown()
         raise DeepDetectError(

@@ -103,8 +103,7 @@ def vlad_vectors(
     for row in range(count):
         own = descriptors(row)
         if len(own) and own.shape[1] == numbers:
-            nearest = _nearest(own, centres)
-            sums = np.zeros_like(centres)
+            sums, nearest = np.zeros_like(centres), _nearest(own, centres)
             np.add.at(sums, nearest, own - centres[nearest])
             sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
             vectors[len(rows)] = sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)

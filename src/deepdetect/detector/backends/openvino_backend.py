@@ -52,15 +52,13 @@ class OpenVinoNetwork:
                 model = self._model = self._compile()
             request = model.create_infer_request()  # one per call, as threads may run at once
             output = request.infer([image], share_inputs=True)[self._output_name]
+            # If memory is short, OpenVINO may also return nothing, or the previous image's map.
+            if self._works and output.shape[2:] != image.shape[2:]:
+                raise MemoryError("OpenVINO gave a map of another size than the image")
         except Exception as error:  # OpenVINO's exceptions share no base class
             self._model = None
             _CORES.clear()
             raise failed_run(error, image.shape) from None
-        # If memory is short, OpenVINO may also return nothing, or the previous image's map.
-        if self._works and output.shape[2:] != image.shape[2:]:
-            self._model = None
-            _CORES.clear()
-            raise MemoryError("OpenVINO gave a map of another size than the image")
         logits = as_logits(output, self._output_name, image.shape, self._path)
         self._works = True
         return logits

@@ -45,8 +45,7 @@ SIZE_PER_SIGMA = 2.5
 
 def least_distances(sigma_px: np.ndarray) -> np.ndarray:
     """Return, for (N,) sigmas, the minimum distances to keypoints of the same or a larger sigma."""
-    radii: np.ndarray = np.maximum(DISTANCE_PX, DISTANCE_PER_SIGMA * sigma_px)
-    return radii
+    return np.asarray(np.maximum(DISTANCE_PX, DISTANCE_PER_SIGMA * sigma_px))
 
 
 def detect_points(
