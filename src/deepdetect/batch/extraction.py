@@ -107,9 +107,7 @@ def extract_features(
         **detector.settings,
         **reading.settings,
         **({} if selection is None else vars(selection)),
-        "descriptor": detector.descriptor_type
-        if isinstance(detector, PointDetector)
-        else ROOT_SIFT,
+        "descriptor": getattr(detector, "descriptor_type", ROOT_SIFT),
         "version": __version__,
     }
     if ignore is not None:

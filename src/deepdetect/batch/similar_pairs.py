@@ -43,8 +43,7 @@ def similar_pairs(
     Returns every pair once, and a sentence on each image whose descriptors are missing, damaged, or
     of another type than those of most images. Images without keypoints are left out silently.
     """
-    failures: dict[str, str] = {}
-    blank: set[str] = set()
+    failures, blank = dict[str, str](), set[str]()
     with open_hdf5(features) as file, progress(len(names), "describing", "image", quiet) as bar:
 
         def descriptors(row: int) -> np.ndarray:

@@ -13,11 +13,9 @@ from .._shared.errors import ImageError
 from .._shared.image_array import Channels, array_to_rgb, deep_values
 from .._shared.opencv import cv2
 
-MAX_SIDE_PX = 240
-"""Longest side of a figure in an HTML summary. Table and figure take about 10 kB."""
-
-MAX_LINES = 60
-"""Maximum number of matches drawn as lines in the figure of an HTML summary. Chosen by hand."""
+MAX_SIDE_PX, MAX_LINES = 240, 60
+"""Longest side of a figure in an HTML summary, which takes about 10 kB with its table, and maximum
+number of matches drawn as lines in it. Chosen by hand."""
 
 Points = tuple[np.ndarray, tuple[int, int]]
 

@@ -24,7 +24,7 @@ On photos/val, learned descriptors at 0.88 are as precise as RootSIFT at 0.85, a
 photographs no more often. At 0.93 they match unrelated photographs four times as often."""
 
 LENGTH, CONSTANT = 64, 16
-"""Of the numbers of a learned descriptor, the first 16 do not change if the image is rotated."""
+"""The first 16 of the 64 numbers of a learned descriptor do not change if the image is rotated."""
 
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
 """The other 48 numbers are first the real and then the imaginary parts of 24 complex numbers. If

@@ -67,8 +67,9 @@ from .misplaced import correct_places
 from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
-MAX_EXHAUSTIVE = 50
-"""The choice "auto" matches all pairs of images if there are at most this many. Chosen by hand."""
+MAX_EXHAUSTIVE, COMPARED_IMAGES = 50, 16
+"""The choice "auto" matches all pairs of images if there are at most the first number. An overlay
+is looked for in the second number of images, the first by name. Chosen by hand."""
 
 WORK = "work"
 """Name of the folder of intermediate results, inside the output folder."""
@@ -76,10 +77,6 @@ WORK = "work"
 LINKS = ".images"
 """Name of a folder inside `WORK` with links to the images, if the user gave a list of files. The
 folder is hidden, so that a search for images in a folder above does not find them twice."""
-
-
-COMPARED_IMAGES = 16
-"""An overlay is looked for in this number of images, the first by name. Chosen by hand."""
 
 
 @suggest_keywords

@@ -258,10 +258,8 @@ def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange 
     scale = max(width / SEARCH_WIDTH_PX, 1.0)
     if scale > 1:
         size = (round(width / scale), max(round(height / scale), 1))
-        left, right = (
-            cv2.resize(view, size, interpolation=cv2.INTER_AREA) for view in (left, right)
-        )
-        scale = width / size[0]
+        small = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (left, right))
+        (left, right), scale = small, width / size[0]
     half = left.shape[1] // 2
     coarse = semi_global_matching(left, right, (-half, half))
     clear = coarse.consistent & (coarse.uniqueness_ratio >= SEARCH_UNIQUENESS_RATIO)
