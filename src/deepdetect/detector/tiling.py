@@ -46,7 +46,7 @@ strides: convolutions need pixels up to 28 px away."""
 
 BYTES_PER_PIXEL, DEFAULT_TILE_MEGAPIXELS = 90, 2.7
 """Approximate memory, in bytes per pixel, of a run without tiles in ONNX Runtime or OpenVINO, and
-the usual size of a tile."""
+usual size of a tile in megapixels."""
 
 Part = Callable[..., list[np.ndarray]]
 

@@ -70,7 +70,6 @@ def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.
         chosen = np.sort(np.random.default_rng(0).permutation(len(lines))[:MAX_LINES])
         for x0, y0, x1, y1 in lines[chosen] * scale:
             start, end = (round(x0), round(y0)), (round(x1) + widths[0], round(y1))
-            cv2.line(
-                picture, start, end, (90, 220, 255)
-            )  # antialiased, the PNG has 5 times the size
+            # Antialiased lines would make the PNG 5 times larger.
+            cv2.line(picture, start, end, (90, 220, 255))
     return picture
