@@ -117,9 +117,6 @@ def write_photographs(folder: Path) -> None:
 @pytest.mark.parametrize("number", range(len(RECIPES)))
 def test_recipes(folder: Path, number: int) -> None:
     recipe = RECIPES[number]
-    if "kornia" in recipe:
-        pytest.importorskip("kornia", reason="needs kornia")
-        recipe = recipe.replace('("sift")', "(None, input_dim=128, add_scale_ori=True)")
     write_photographs(folder)
     found: dict[str, object] = {}
     exec(compile(recipe, "recipes.md", "exec"), found)
