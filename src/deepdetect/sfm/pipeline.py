@@ -101,10 +101,8 @@ def reconstruct_many(
     target = Path(output)
     control = _check_arguments(images, target, calibration, focal_px, options)
     detector = PointDetector(MAX_KEYPOINTS) if detector is None else detector
-    if overwrite:
-        work = target / WORK
-        if any(work.glob("features.h5*")):  # else it is another program's folder
-            shutil.rmtree(work, ignore_errors=True)
+    if overwrite and any((target / WORK).glob("features.h5*")):  # else another program's folder
+        shutil.rmtree(target / WORK, ignore_errors=True)
     stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):

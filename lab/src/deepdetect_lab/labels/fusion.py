@@ -26,9 +26,6 @@ from deepdetect.viz.draw import add_caption
 from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
 
-GAP_PX = 6
-"""Joined images are separated by gaps of this width, in pixels. Chosen by hand."""
-
 LOW_VISIBILITY_RANGE = 64
 """An image has low visibility if its luma spans fewer grey levels; `visibility_of` says why."""
 
@@ -169,13 +166,13 @@ def label_file(task: LabelTask) -> dict[str, Any] | str:
     return {**files, "visibility": label.visibility, "density": label.density}
 
 
-def join_pictures(panels: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Join images of one size in a grid of `columns` columns, with white gaps."""
+def join_pictures(panels: Sequence[np.ndarray], columns: int, gap_px: int = 6) -> np.ndarray:
+    """Join images of one size in a grid of `columns` columns, with white gaps of `gap_px`."""
     height, width = panels[0].shape[:2]
     rows = -(-len(panels) // columns)
-    size = rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3
+    size = rows * (height + gap_px) - gap_px, columns * (width + gap_px) - gap_px, 3
     joined = np.full(size, 255, np.uint8)
     for k, panel in enumerate(panels):
-        top, left = k // columns * (height + GAP_PX), k % columns * (width + GAP_PX)
+        top, left = k // columns * (height + gap_px), k % columns * (width + gap_px)
         joined[top : top + height, left : left + width] = panel
     return joined
