@@ -41,7 +41,7 @@ from deepdetect_lab.evaluation.protocols.planar import pairs_of
 from deepdetect_lab.evaluation.protocols.standard import MATCHING_BUDGET, pair_row
 from deepdetect_lab.evaluation.report import Row, Table, mean, where
 from deepdetect_lab.evaluation.run import Run
-from deepdetect_lab.labels.detectors import opencv_factory
+from deepdetect_lab.labels.factories import opencv_factory
 
 SIZE_PX = (800, 600)
 ROUNDS = 15

@@ -62,7 +62,7 @@ def test_bytes_equal_a_naive_search_both_ways(
 ) -> None:
     """Also where sums are as large as they can be, and where many distances are equal."""
     if not signed:
-        product = matchers._product("unsigned"), 0
+        product = matchers.session_of(matchers.PRODUCTS / "unsigned.onnx"), 0
         monkeypatch.setattr(matchers, "_byte_product", lambda: product)
     rng = np.random.default_rng(0)
     queries = rng.choice(np.array([0, 255, 3], np.uint8), (170, 128), p=[0.1, 0.8, 0.1])

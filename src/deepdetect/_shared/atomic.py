@@ -18,11 +18,9 @@ from pathlib import Path
 
 from .errors import DeepDetectError
 
-ABANDONED_S = 24 * 3600.0
-"""A temporary file of another machine is removed at this age, in seconds. Chosen by hand."""
-
-STEM_LENGTH = 40
-"""A temporary name has up to this many characters of the final name: file systems limit names."""
+ABANDONED_S, STEM_LENGTH = 24 * 3600.0, 40
+"""A temporary file of another machine is removed at this age, in seconds. A temporary name has up
+to this many characters of the final name, because file systems limit names."""
 
 # The owner in a temporary name is a machine, a process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")

@@ -132,8 +132,7 @@ DISTRIBUTIONS = {
 
 def install_command(*packages: str) -> str:
     """Return the command that installs modules, for the message of a `MissingExtraError`."""
-    names = " ".join(DISTRIBUTIONS.get(package, package) for package in packages)
-    command = f"pip install {names}"
+    command = " ".join(["pip install", *(DISTRIBUTIONS.get(one, one) for one in packages)])
     return f"{command}, {WITHOUT_GPU}" if "torch" in packages else command
 
 
@@ -141,11 +140,8 @@ def require_packages(what: str, *packages: str) -> None:
     """Raise a MissingExtraError if one of the packages that `what` needs is not installed."""
     missing = [package for package in packages if importlib.util.find_spec(package) is None]
     if missing:
-        names = ", ".join(missing)
-        kinds = "packages" if len(missing) > 1 else "package"
-        raise MissingExtraError(
-            f"{what} needs the {kinds} {names}: run {install_command(*missing)}"
-        )
+        names = f"package{'s' * (len(missing) > 1)} {', '.join(missing)}"
+        raise MissingExtraError(f"{what} needs the {names}: run {install_command(*missing)}")
 
 
 @contextmanager

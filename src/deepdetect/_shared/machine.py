@@ -32,11 +32,9 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
-PARTS_PER_THREAD = 4
-"""`parallel_for` divides a range into this many parts per thread, so fast threads can take more."""
-
-TASKS_PER_WORKER = 8
-"""`map_in_processes` queues this many tasks per worker, so that no worker idles. Chosen by hand."""
+PARTS_PER_THREAD, TASKS_PER_WORKER = 4, 8
+"""`parallel_for` makes this many parts per thread, and `map_in_processes` queues this many tasks
+per worker, so that none idles. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
 """If the work is interrupted or fails, running workers are killed after this many seconds."""
@@ -58,9 +56,6 @@ BYTES_PER = {
 }
 """Measured bytes of memory that each item needs; `needed_memory` multiplies them by counts."""
 
-DEFAULT_MEMORY = 4_000_000_000
-"""Bytes of memory assumed to be available if the system does not report them."""
-
 # M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no block is mapped on its own, and the
 # heap is never trimmed, and grows in steps of 256 MB.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
@@ -71,7 +66,6 @@ _max_threads: int | None = None
 
 _chosen = threading.local()
 """The attribute `threads` is the limit that `limited_threads` has set in the current thread."""
-
 
 TaskMap = Callable[..., Iterator[Any]]
 """Type of `map_in_processes`, and of functions that do the same on a cluster."""
@@ -118,7 +112,6 @@ def map_in_processes(
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     remaining = iter(tasks)
-
     pending: deque[Future[tuple[Outcome, list[str]]]] = deque()
 
     def submit(most: int) -> None:
@@ -229,16 +222,15 @@ def thread_limit() -> int | None:
     """
     if chosen := getattr(_chosen, "threads", None):
         return int(chosen)
+    if _max_threads is not None:
+        return _max_threads
+    wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    if wished.isdecimal() and int(wished):
+        return int(wished)
     # multiprocessing is not imported for this: its own child processes have imported it already.
     parent_of = getattr(sys.modules.get("multiprocessing.process"), "parent_process", None)
-    wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    if _max_threads is None and wished.isdecimal() and int(wished):
-        return int(wished)
-    if _max_threads is None and (
-        (parent_of and parent_of()) or processor_count() < (os.cpu_count() or 1)
-    ):
-        return processor_count()
-    return _max_threads
+    is_child = parent_of and parent_of()
+    return processor_count() if is_child or processor_count() < (os.cpu_count() or 1) else None
 
 
 def end_with_parent(end: Callable[[], object] = lambda: None) -> None:
@@ -333,7 +325,7 @@ def _system_memory() -> int:
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvail"))
     with suppress(AttributeError, ValueError):  # Windows
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-    return DEFAULT_MEMORY
+    return 4_000_000_000  # assumed if the system reports nothing
 
 
 def _container_memory() -> int:

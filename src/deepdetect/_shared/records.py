@@ -144,7 +144,9 @@ class Outputs:
             return None
         records = [self._known(path) for path in self.paths]
         for path, record in zip(self.paths, records, strict=True):
-            if record and record["digest"] and not _is_unchanged(path, record):
+            if not record or not record["digest"] or list(file_state(path)) == record["state"]:
+                continue
+            if file_digest(path) != record["digest"]:  # copied files only have other times
                 raise OptionError(f"{path} exists, and was changed after it was made: {ADVICE}")
         states = [list(file_state(path)) for path in self.inputs]
         done = all(record and record["whole"] and record["states"] == states for record in records)
@@ -176,7 +178,11 @@ class Outputs:
         except BaseException:
             for path, record, (state, content) in zip(self.paths, records, before, strict=True):
                 if file_state(path) == state:
-                    _restore(record, content)
+                    with contextlib.suppress(OSError, DeepDetectError):
+                        if content is None:
+                            record.unlink()
+                        else:
+                            _write(record, content)
             for folder in sorted(missing, reverse=True):  # inner folders first
                 with contextlib.suppress(OSError):  # the folder is not empty
                     folder.rmdir()
@@ -210,8 +216,7 @@ class Outputs:
             whole = done and path.exists()
             digest = file_digest(path) if whole and path.is_file() else None
             state = {"whole": whole, "state": file_state(path), "digest": digest}
-            with atomic_path(_record(path)) as temporary:
-                temporary.write_text(json.dumps(note | state), encoding="utf-8")
+            _write(_record(path), json.dumps(note | state).encode())
 
 
 def _record(output: Path) -> Path:
@@ -220,26 +225,16 @@ def _record(output: Path) -> Path:
 
 def _read(output: Path) -> dict[str, Any] | None:
     """Read the record of an output; return None if the record is missing or damaged."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         record = json.loads(_record(output).read_bytes())
-    except (OSError, ValueError):
-        return None
-    fields = {"inputs", "states", "settings", "values", "whole", "state", "digest"}
-    return record if isinstance(record, dict) and fields <= {*record} else None
+        fields = {"inputs", "states", "settings", "values", "whole", "state", "digest"}
+        return record if isinstance(record, dict) and fields <= {*record} else None
+    return None
 
 
-def _restore(record: Path, content: bytes | None) -> None:
-    with contextlib.suppress(OSError, DeepDetectError):
-        if content is None:
-            record.unlink()
-        else:
-            with atomic_path(record) as temporary:
-                temporary.write_bytes(content)
-
-
-def _is_unchanged(path: Path, record: Mapping[str, Any]) -> bool:
-    # In a copied folder, files have other times but the same digests.
-    return list(file_state(path)) == record["state"] or file_digest(path) == record["digest"]
+def _write(record: Path, content: bytes) -> None:
+    with atomic_path(record) as temporary:
+        temporary.write_bytes(content)
 
 
 def inputs_of(path: Path) -> list[str]:

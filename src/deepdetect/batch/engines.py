@@ -33,8 +33,8 @@ MAX_BLOCKS = 4096
 """Tasks are divided into at most this many parts, because a part costs Ray some milliseconds."""
 
 PROCESSORS_PER_WORKER = 0.5
-"""Each worker reserves only this fraction of a processor in Ray. If half of the machines are lost,
-the others can therefore take over all workers, for which tasks would otherwise wait forever."""
+"""Each worker reserves only this fraction of a processor in Ray, so that half of the machines can
+take over all workers, for which tasks would otherwise wait forever."""
 
 OBJECT_STORE_BYTES = 200_000_000
 """Shared memory of a cluster that this module starts: little, because results go to files."""
@@ -61,7 +61,13 @@ def map_on_ray(
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")
-    ray = _import_ray()
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
+    require_packages("the engine ray", "ray")
+    import ray
+    import ray.data
+    import ray.exceptions
+
     if not len(tasks):
         return
     # Ray prints messages about its workers to standard output, which is for results.
@@ -105,26 +111,10 @@ class _Worker:
         return {"outcome": pickle.dumps(outcome)}
 
 
-def _import_ray() -> Any:
-    for name, value in SETTINGS.items():
-        os.environ.setdefault(name, value)
-    require_packages("the engine ray", "ray")
-    import ray
-    import ray.data
-    import ray.exceptions
-
-    return ray
-
-
 def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
+    options = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES, **quiet}
     try:
-        ray.init(
-            address="local",
-            num_cpus=processors,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            **quiet,
-        )
+        ray.init(address="local", num_cpus=processors, **options)
     except Exception as error:  # Ray raises errors of many types, after half a minute
         ray.shutdown()
         raise DeepDetectError(

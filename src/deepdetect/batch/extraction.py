@@ -110,9 +110,7 @@ def extract_features(
         **detector.settings,
         **reading.settings,
         **({} if selection is None else vars(selection)),
-        "descriptor": detector.descriptor_type
-        if isinstance(detector, PointDetector)
-        else ROOT_SIFT,
+        "descriptor": getattr(detector, "descriptor_type", ROOT_SIFT),
         "version": __version__,
     }
     if len(masks := [ignore] if isinstance(ignore, np.ndarray) else [*ignore]):
@@ -121,14 +119,8 @@ def extract_features(
         path,
         settings,
         {name: {name: file_state(root / name)} for name in utf8},
-        partial(
-            _extract,
-            root=root,
-            selection=selection,
-            ignore=masks,
-            detector=detector,
-            reading=reading,  # other processes do not inherit these options
-        ),
+        # Other processes do not inherit the reading options.
+        partial(_extract, root, detector, selection, masks, reading),
         of="images",
         others_stay=lambda _: False,
         engine=engine,
@@ -152,14 +144,14 @@ def noted_range(path: str | Path) -> ValueRange | None:
 
 
 def _extract(
-    images: Sequence[Item],
-    counts: dict[str, int],
-    failures: list[str],
     root: Path,
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
     ignore: Sequence[np.ndarray],
     reading: ReadingOptions,
+    images: Sequence[Item],
+    counts: dict[str, int],
+    failures: list[str],
 ) -> Iterator[Group]:
     for name, state in images:
         with noted_failures(name, failures):
@@ -214,16 +206,7 @@ def read_keypoints(file: Any, name: str) -> Keypoints:
     try:
         settings = json.loads(file.attrs.get(SETTINGS, "{}"))
         return _keypoints_of(file[name], settings.get("descriptor"))
-    # For damaged files, h5py raises any of these; a wrong shape can need too much memory.
-    except (
-        OSError,
-        RuntimeError,
-        LookupError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        MemoryError,
-    ) as error:
+    except Exception as error:  # h5py and NumPy raise many types of errors for damaged files
         raise damaged(Path(f"{file.filename}, {name}"), error) from error
 
 

@@ -46,11 +46,9 @@ STATE = "source_state"
 FORMAT = ("v110", "v110")
 """Oldest and newest file format to write: HDF5 1.10 (2016), in which large groups are fast."""
 
-MIN_SHARDS = 256
-"""Minimum number of shards, if there are enough inputs, to keep workers busy. Chosen by hand."""
-
-LARGEST_SHARD = 32
-"""Maximum number of inputs of a shard, because a killed worker loses its shard. Chosen by hand."""
+MIN_SHARDS, LARGEST_SHARD = 256, 32
+"""There are at least this many shards if there are enough inputs, to keep workers busy. A shard has
+at most this many inputs, because a killed worker loses its shard. Chosen by hand."""
 
 State = tuple[int, ...]
 """State of an input: whole numbers that change if the input changes, such as size and time."""
@@ -234,10 +232,13 @@ def fill_file(
             if not any(states.get(group) == state for group, state in groups.items())
         ]
         skipped = len(wanted) - len(left)
-        counts: dict[Any, int] = {}
-        failures: list[str] = []
+        counts, failures = dict[Any, int](), list[str]()
+        size = min(LARGEST_SHARD, max(1, len(left) // MIN_SHARDS))
+        parts = [left[k : k + size] for k in range(0, len(left), size)]
+        # A digest of the names of its inputs names the file of each shard.
+        tasks = [(shards / f"{key([name for name, _ in part])}.h5", part) for part in parts]
         with progress(len(wanted), of, of.removesuffix("s"), quiet, skipped) as bar:
-            for made, failed in map_tasks(work, _divided(left, shards), workers):
+            for made, failed in map_tasks(work, tasks, workers):
                 bar.update(len(made) + len(failed))
                 counts |= made
                 failures += failed
@@ -270,19 +271,11 @@ def _shard_files(folder: Path) -> list[Path]:
     return sorted(shards, key=lambda path: (path.stat().st_mtime_ns, path.name))
 
 
-def _divided(items: Sequence[Item], folder: Path) -> list[tuple[Path, Sequence[Item]]]:
-    """Divide inputs into shards; name each shard's file by a digest of the names of its inputs."""
-    size = min(LARGEST_SHARD, max(1, len(items) // MIN_SHARDS))
-    parts = [items[k : k + size] for k in range(0, len(items), size)]
-    return [(folder / f"{key([name for name, _ in part])}.h5", part) for part in parts]
-
-
 def _write_shard(
     task: tuple[Path, Sequence[Item]], make: MakeGroups
 ) -> tuple[dict[Any, int], list[str]]:
     path, items = task
-    counts: dict[Any, int] = {}
-    failures: list[str] = []
+    counts, failures = dict[Any, int](), list[str]()
     write_groups(path, make(items, counts, failures))
     return counts, failures
 

@@ -68,12 +68,8 @@ class PairMatchingOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("inlier_threshold", "ratio"),
-            not_negative=("seed",),
-            fractions=("ratio",),
-        )
+        positive = "inlier_threshold", "ratio"
+        check_ranges(self, positive=positive, not_negative=("seed",), fractions=("ratio",))
         check_filter(self.filter_by, self.ratio, self.mutual)
         check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
         if self.verify == "essential":
@@ -148,11 +144,10 @@ def match_pairs(
         require_suited(first)
     with open_hdf5(source) as file:
         names = natsorted(feature_names(file), alg=ns.PATH)
-    listed, unlike = (
-        similar_pairs(source, names, alike, options.seed, quiet)
-        if alike
-        else (list_pairs(pairs, names), [])
-    )
+    if alike:
+        listed, unlike = similar_pairs(source, names, alike, options.seed, quiet)
+    else:
+        listed, unlike = list_pairs(pairs, names), []
     wanted, failures, gone, made_with = _find_pairs(source, listed)
     report = fill_file(
         path,
@@ -189,10 +184,8 @@ def _find_pairs(
     features; a sentence on each other pair; the groups of pairs without features, which are
     obsolete; and a digest of the settings of the features.
     """
-    wanted: dict[Pair, dict[str, State]] = {}
-    failures: list[str] = []
-    gone: set[str] = set()
-    taken: dict[str, Pair] = {}
+    wanted, taken = dict[Pair, dict[str, State]](), dict[str, Pair]()
+    failures, gone = list[str](), set[str]()
     with open_hdf5(features) as file:
         settings = key(str(file.attrs.get(SETTINGS)))
         states = {name: _state(file, name) for name in {name for pair in pairs for name in pair}}
@@ -268,10 +261,8 @@ def _match(
 ) -> tuple[np.ndarray, np.ndarray]:
     taken = "matcher", "filter_by", "ratio", "mutual", "seed"
     found = match_features(features0, features1, **{name: getattr(options, name) for name in taken})
-    kept = found.inliers
+    kept, how = found.inliers, GeometryOptions(inlier_threshold=options.inlier_threshold)
     if options.verify is not None:
-        geometry = GeometryOptions(inlier_threshold=options.inlier_threshold)
-        kept = estimate_geometry(
-            found, model=options.verify, seed=options.seed, options=geometry
-        ).inliers
+        model, seed = options.verify, options.seed
+        kept = estimate_geometry(found, model=model, seed=seed, options=how).inliers
     return np.column_stack([found.indices0, found.indices1])[kept], found.scores[kept]

@@ -28,8 +28,7 @@ WORDS, DESCRIPTORS_OF_WORD = 64, 8
 """The vocabulary has `WORDS` words, or fewer, so that each has at least `DESCRIPTORS_OF_WORD`
 training descriptors on average. Chosen by hand."""
 
-KMEANS_ITERATIONS = 10
-TRAINING_IMAGES, TRAINING_DESCRIPTORS = 500, 50_000
+TRAINING_IMAGES, TRAINING_DESCRIPTORS, KMEANS_ITERATIONS = 500, 50_000, 10
 """The vocabulary is trained on at most these numbers of images and descriptors, to save time."""
 
 COMPARED_ROWS = 256
@@ -44,8 +43,7 @@ def similar_pairs(
     Returns every pair once, and a sentence on each image whose descriptors are missing, damaged, or
     of another type than those of most images. Images without keypoints are left out silently.
     """
-    failures: dict[str, str] = {}
-    blank: set[str] = set()
+    failures, blank = dict[str, str](), set[str]()
     with open_hdf5(features) as file, progress(len(names), "describing", "image", quiet) as bar:
 
         def descriptors(row: int) -> np.ndarray:
@@ -95,13 +93,16 @@ def vlad_vectors(
         return np.empty((0, 0), np.float32), np.empty(0, np.int64)
     numbers = Counter(own.shape[1] for own in found).most_common(1)[0][0]
     alike = [own for own in found if own.shape[1] == numbers]
-    centres = _vocabulary(np.concatenate(alike), rng)
+    sample = rng.permutation(np.concatenate(alike))[:TRAINING_DESCRIPTORS]
+    words = sample[: min(WORDS, max(1, len(sample) // DESCRIPTORS_OF_WORD))]
+    criteria = (cv2.TERM_CRITERIA_COUNT, KMEANS_ITERATIONS, 0.0)
+    nearest, flags = _nearest(sample, words).astype(np.int32), cv2.KMEANS_USE_INITIAL_LABELS
+    centres = cv2.kmeans(sample, len(words), nearest, criteria, 1, flags)[2]
     vectors, rows = np.empty((count, centres.size), np.float32), list[int]()
     for row in range(count):
         own = descriptors(row)
         if len(own) and own.shape[1] == numbers:
-            nearest = _nearest(own, centres)
-            sums = np.zeros_like(centres)
+            sums, nearest = np.zeros_like(centres), _nearest(own, centres)
             np.add.at(sums, nearest, own - centres[nearest])
             sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
             vectors[len(rows)] = sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)
@@ -118,15 +119,6 @@ def most_alike(vectors: np.ndarray, count: int) -> Iterator[np.ndarray]:
         own = np.arange(len(apart))
         apart[own, start + own] = np.inf
         yield from np.argpartition(apart, last, axis=1)[:, :last]
-
-
-def _vocabulary(descriptors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    descriptors = rng.permutation(descriptors)[:TRAINING_DESCRIPTORS]
-    centres = descriptors[: min(WORDS, max(1, len(descriptors) // DESCRIPTORS_OF_WORD))]
-    nearest = _nearest(descriptors, centres).astype(np.int32)
-    criteria = (cv2.TERM_CRITERIA_COUNT, KMEANS_ITERATIONS, 0.0)
-    flags = cv2.KMEANS_USE_INITIAL_LABELS
-    return cv2.kmeans(descriptors, len(centres), nearest, criteria, 1, flags)[2]
 
 
 def _nearest(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:

@@ -24,10 +24,7 @@ from ..features.selection import (
 from ..features.sift import describe_keypoints
 from ..io.image import (
     Images,
-    batch_length,
-    ignore_masks,
-    image_named,
-    load_each,
+    found_in_each,
     load_image,
     load_pixels,
     load_visible,
@@ -292,11 +289,9 @@ class DeepDetect:
             OptionError: an option is out of its range, or a mask has another size than its image.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        masks, found = ignore_masks(ignore, batch_length(images)), []
-        for number, rgb in load_each(images, channels):
-            with image_named(number):
-                found.append(self._select(rgb, options, masks[number]))
-        return found
+        return found_in_each(
+            images, channels, ignore, lambda rgb, mask: self._select(rgb, options, mask)
+        )
 
     @suggest_keywords
     def extract(
@@ -370,9 +365,9 @@ def find_keypoints(
     """
     check_selection(detector, selection)
     rgb, ignore = load_visible(rgb, ignore=ignore)
-    if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):
-        raise OptionError(f"the detector {detector!r} has no method detect: use a DeepDetect")
-    if hasattr(detector, "detect") and not hasattr(detector, "heatmap"):
+    if not hasattr(detector, "heatmap"):
+        if not hasattr(detector, "detect"):
+            raise OptionError(f"the detector {detector!r} has no method detect: use a DeepDetect")
         found = detector.detect(rgb, ignore=ignore)
         if not ((found.xy >= -0.5) & (found.xy < np.array(rgb.shape[1::-1]) - 0.5)).all():
             raise OptionError(

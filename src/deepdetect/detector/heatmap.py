@@ -134,8 +134,7 @@ def _seen(rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
         return seen
     kind = cv2.INTER_AREA if options.resolution == "auto" else cv2.INTER_CUBIC
     size = seen_size(rgb.shape, options)
-    scaled: np.ndarray = cv2.resize(np.ascontiguousarray(seen), size, interpolation=kind)
-    return scaled
+    return cv2.resize(np.ascontiguousarray(seen), size, interpolation=kind)
 
 
 def _enlarged(logits: np.ndarray, shape: tuple[int, ...]) -> Maps:

@@ -18,17 +18,7 @@ from ..features.keypoints import Keypoints
 from ..features.learned import LEARNED
 from ..features.selection import check_ignore, check_max_keypoints, without_frame
 from ..features.sift import ROOT_SIFT, describe_keypoints
-from ..io.image import (
-    Images,
-    batch_length,
-    ignore_masks,
-    image_named,
-    load_each,
-    load_image,
-    load_pixels,
-    load_visible,
-    luma,
-)
+from ..io.image import Images, found_in_each, load_image, load_pixels, load_visible, luma
 from .backends.interface import RuntimeOptions
 from .heatmap import MAX_AUTO_PIXELS, memory_named
 from .points.descriptor import DESCRIPTOR_GRAPHS, describe_learned, descriptor_type
@@ -189,11 +179,9 @@ class PointDetector:
             ImageError: an image cannot be read or is unsuitable.
             OptionError: a mask has another size than its image.
         """
-        masks, found = ignore_masks(ignore, batch_length(images)), []
-        for number, rgb in load_each(images, channels):
-            with image_named(number):
-                found.append(self._find(rgb, masks[number], max_keypoints))
-        return found
+        return found_in_each(
+            images, channels, ignore, lambda rgb, mask: self._find(rgb, mask, max_keypoints)
+        )
 
     @suggest_keywords
     def extract(
@@ -254,20 +242,19 @@ class PointDetector:
         )
 
     def _find(
-        self, rgb: np.ndarray, ignore: np.ndarray | None, max_keypoints: int | None = None
+        self, rgb: np.ndarray, ignore: np.ndarray | None, max_keypoints: int | None
     ) -> Keypoints:
         check_max_keypoints(max_keypoints)
         most = self.max_keypoints if max_keypoints is None else int(max_keypoints)
         rgb, ignore = load_visible(rgb, ignore=ignore)
         gray = luma(rgb)
-        height, width = gray.shape
+        whole = gray.shape[::-1]
         if ignore is not None:
             ignore = check_ignore(ignore, gray.shape)
         ignore = without_frame(rgb, ignore)
         gray = self._scaled(gray)
-        size = (gray.shape[1], gray.shape[0])
-        scaled = size != (width, height)
-        if scaled and ignore is not None:
+        size = gray.shape[::-1]
+        if size != whole and ignore is not None:
             # A pixel of the scaled image is ignored if it or a neighbour covers an ignored pixel.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
@@ -275,15 +262,12 @@ class PointDetector:
             found = detect_points(
                 gray, most, spread=self.spread, ignore=ignore, ranker=self._ranker
             )
-        if not scaled:
+        if size == whole:
             return found
-        factor = np.divide((width, height), size)
-        return replace(
-            found,
-            xy=(found.xy + 0.5) * factor - 0.5,
-            image_size=(width, height),
-            sizes=None if found.sizes is None else found.sizes * factor.mean(),
-        )
+        assert found.sizes is not None
+        factor = np.divide(whole, size)
+        xy, sizes = (found.xy + 0.5) * factor - 0.5, found.sizes * factor.mean()
+        return replace(found, xy=xy, image_size=whole, sizes=sizes)
 
     def _scaled(self, gray: np.ndarray) -> np.ndarray:
         height, width = gray.shape

@@ -40,16 +40,13 @@ AVERAGES, MAXIMA = (
 THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
 """The constants from `COUNTED` to `THRESHOLDS` name the tensors at which the network is cut."""
 
-SCALES = (4, 2, 1)
-"""Rows and columns of the three feature maps per 8 (`STRIDE`) rows and columns of the image."""
+SCALES, MARGIN = (4, 2, 1), 4
+"""Rows and columns of the three feature maps per stride of 8 px, and the border around each tile in
+strides: convolutions need pixels up to 28 px away."""
 
-MARGIN = 4
-"""Border around each tile, in strides of 8 px: convolutions need pixels up to 28 px away."""
-
-BYTES_PER_PIXEL = 90
-"""Approximate memory, in bytes per pixel, of a run without tiles in ONNX Runtime or OpenVINO."""
-
-DEFAULT_TILE_MEGAPIXELS = 2.7
+BYTES_PER_PIXEL, DEFAULT_TILE_MEGAPIXELS = 90, 2.7
+"""Approximate memory, in bytes per pixel, of a run without tiles in ONNX Runtime or OpenVINO, and
+usual size of a tile in megapixels."""
 
 Part = Callable[..., list[np.ndarray]]
 
@@ -88,9 +85,9 @@ class TiledNetwork:
                     sums[k] = sums[k] + core.sum((2, 3), np.float64, keepdims=True)
                     maxima[k] = np.maximum(maxima[k], core.max((2, 3), keepdims=True))
                 bar.update(1)
+            counts = height * width * np.square(SCALES)
             averages = [
-                (total / (height * width * scale**2)).astype(np.float32)
-                for total, scale in zip(sums, SCALES, strict=True)
+                (s / count).astype(np.float32) for s, count in zip(sums, counts, strict=True)
             ]
             thresholds = self.threshold(counted, *averages, *maxima)
             for rows, columns in tiles:

@@ -13,11 +13,9 @@ from .._shared.errors import ImageError
 from .._shared.image_array import Channels, array_to_rgb, deep_values
 from .._shared.opencv import cv2
 
-MAX_SIDE_PX = 240
-"""Longest side of a figure in an HTML summary. Table and figure take about 10 kB."""
-
-MAX_LINES = 60
-"""Maximum number of matches drawn as lines in the figure of an HTML summary. Chosen by hand."""
+MAX_SIDE_PX, MAX_LINES = 240, 60
+"""Longest side of a figure in an HTML summary, which takes about 10 kB with its table, and maximum
+number of matches drawn as lines in it. Chosen by hand."""
 
 Points = tuple[np.ndarray, tuple[int, int]]
 
@@ -39,10 +37,7 @@ def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.n
 
 
 def html_summary(
-    title: str,
-    rows: Mapping[str, str],
-    points: Sequence[Points],
-    lines: np.ndarray | None = None,
+    title: str, rows: Mapping[str, str], points: Sequence[Points], lines: np.ndarray | None = None
 ) -> str:
     """Return HTML of about 10 kB with a small table and a figure of the positions of keypoints.
 
@@ -75,7 +70,6 @@ def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.
         chosen = np.sort(np.random.default_rng(0).permutation(len(lines))[:MAX_LINES])
         for x0, y0, x1, y1 in lines[chosen] * scale:
             start, end = (round(x0), round(y0)), (round(x1) + widths[0], round(y1))
-            cv2.line(
-                picture, start, end, (90, 220, 255)
-            )  # antialiased lines would make the PNG 5 times larger
+            # Antialiased lines would make the PNG 5 times larger.
+            cv2.line(picture, start, end, (90, 220, 255))
     return picture

@@ -14,20 +14,15 @@ import numpy as np
 
 from .._shared.kernels import compiled
 
-TILE_COLUMNS = 32
-"""Width of a tile of dense SIFT, in columns of the lattice of keypoints. Chosen by hand."""
-
-TILE_HEIGHT = 96
-"""Height of a tile of dense SIFT, in pixels. Chosen by hand."""
+TILE_COLUMNS, TILE_HEIGHT = 32, 96
+"""Width of a tile of dense SIFT in columns of keypoints, and height in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
 """Dense SIFT sums this many taps of a filter at a time, so spans of taps are padded to fit."""
 
-BINS = 36
-"""Number of bins in the histogram of gradient directions around a keypoint, as in Lowe (2004)."""
-
-RADIUS_PER_WINDOW = 3.0
-"""Pixels within this many sigmas of the Gaussian window vote for a direction, as in OpenCV."""
+BINS, RADIUS_PER_WINDOW = 36, 3.0
+"""Directions around a keypoint have this many bins, as in Lowe (2004). Pixels within this many
+sigmas of the Gaussian window vote for them, as in OpenCV."""
 
 CHUNK = 64
 """Exact search keeps the minimum of each chunk of this many distances, to find rows faster."""
@@ -208,16 +203,6 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
     return total
 
 
-@compiled(nogil=True, inline="always")
-def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
-    """Return the two nearest of three rows, and their distances."""
-    if distance < nearer:
-        return row, best, distance, nearer
-    if distance < farther:
-        return best, row, nearer, distance
-    return best, second, nearer, farther
-
-
 # The flag "nnan" rules out NaN, so that the compiler can find minima by vector instructions.
 @compiled(nogil=True, fastmath={"nnan", "nsz"})
 def scan_products(products, terms0, terms1, start, rows, values, nearest, best, second):  # type: ignore[no-untyped-def]
@@ -271,8 +256,7 @@ def _hash(number):  # type: ignore[no-untyped-def]
     number = np.uint32(number * np.uint32(0x7FEB352D))
     number ^= number >> np.uint32(15)
     number = np.uint32(number * np.uint32(0x846CA68B))
-    number ^= number >> np.uint32(16)
-    return number
+    return number ^ (number >> np.uint32(16))
 
 
 @compiled(nogil=True)
@@ -343,9 +327,10 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
                 row = at1[y, x]
                 if row >= 0 and row != best and row != second:
                     distance = _distance(queries, query, base, row)
-                    best, second, nearer, farther = _insert(
-                        row, distance, best, second, nearer, farther
-                    )
+                    if distance < nearer:
+                        best, second, nearer, farther = row, best, distance, nearer
+                    elif distance < farther:
+                        second, farther = row, distance
             rows[query, 0], rows[query, 1] = best, second
             distances[query, 0], distances[query, 1] = nearer, farther
 
@@ -401,11 +386,7 @@ def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def
     for window in windows:
         side = max(side, 2 * int(np.rint(RADIUS_PER_WINDOW * window)) + 1)
     room = min(side, height) * min(side, width)
-    dx, dy, weights = (
-        np.empty(room, np.float32),
-        np.empty(room, np.float32),
-        np.empty(room, np.float32),
-    )
+    dx, dy, weights = np.empty((3, room), np.float32)
     bins = np.empty(room, np.int32)
     across = np.empty(min(side, width), np.float32)
     votes, smooth = np.empty((2, BINS + 1)), np.empty(BINS)

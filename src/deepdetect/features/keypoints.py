@@ -339,9 +339,7 @@ def nearest_keypoints(
     pixels = np.floor(np.asarray(xy) + np.float32(0.5)).astype(np.int64).reshape(-1, 2)
     rows = np.flatnonzero(((pixels >= 0) & (pixels < image_size)).all(axis=1))[::-1]
     grid = np.full((height, width), -1, np.int32)
-    grid[pixels[rows, 1], pixels[rows, 0]] = (
-        rows  # in reverse, so that the first keypoint on a pixel remains
-    )
+    grid[pixels[rows, 1], pixels[rows, 0]] = rows  # reversed: the first on a pixel remains
     positions, xy = (np.ascontiguousarray(points, np.float64) for points in (positions, xy))
     nearest = np.full(len(positions), -1, np.int32)
     distances = np.full(len(positions), np.inf)

@@ -23,15 +23,12 @@ RATIO, LEARNED_RATIO = 0.85, 0.88
 On photos/val, learned descriptors at 0.88 are as precise as RootSIFT at 0.85, and match unrelated
 photographs no more often. At 0.93 they match unrelated photographs four times as often."""
 
-LENGTH = 64
-
-CONSTANT = 16
-"""The first 16 numbers of a learned descriptor do not change if the image is rotated."""
+LENGTH, CONSTANT = 64, 16
+"""The first 16 of the 64 numbers of a learned descriptor do not change if the image is rotated."""
 
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
-"""The remaining 48 numbers of a descriptor are first the real and then the imaginary parts of 24
-complex numbers. If the image is rotated, the phase of each complex number grows by the angle of
-rotation times its factor in this array."""
+"""The other 48 numbers are first the real and then the imaginary parts of 24 complex numbers. If
+the image is rotated, the phase of each grows by the angle times its factor in this array."""
 
 UPRIGHT_DEGREES = 15.0
 """Smaller rotations between images need not be undone: networks have learned to tolerate them."""
@@ -40,8 +37,7 @@ TURNED_KEYPOINTS = 512
 """This many keypoints of each image, the best ones, are matched to estimate the rotation between
 the images. Chosen by hand."""
 
-HISTOGRAM_DEGREES = 10
-NEAR_DEGREES = 20
+HISTOGRAM_DEGREES, NEAR_DEGREES = 10, 20
 """`common_turn` makes a histogram of angles with bins of width `HISTOGRAM_DEGREES`. It returns the
 median of the angles within `NEAR_DEGREES` of the fullest bin. Chosen by hand."""
 

@@ -9,27 +9,22 @@ discards correct matches on repeated structures.
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from .._shared.errors import OptionError, check_name
 from .._shared.opencv import cv2
-from .._shared.runtimes import start_session
 from .keypoints import Keypoints
 from .learned import CROSS_MODAL, UPRIGHT_DEGREES, common_turn, is_learned
-from .matchers import DescriptorMatches
+from .matchers import DescriptorMatches, session_of
 from .sift import ROOT_SIFT
 
 MATCH_FILTER = Path(__file__).with_name("match_filter.onnx")
 
-AROUND = 8
-"""Number of nearest matches, in each image, that the network needs to judge a match."""
-
-MOST_DISTINCT = 512
-"""This many matches with the lowest ratios tell the rotation between images. Chosen by hand."""
+AROUND, MOST_DISTINCT = 8, 512
+"""The network judges a match by this many nearest matches in each image. The second number of
+matches, those with the lowest ratios, tell the rotation between images. Chosen by hand."""
 
 FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
 """FLANN's codes for a kd-tree for few dimensions, and for an exact search."""
@@ -75,7 +70,7 @@ def filter_matches(
     if len(matches) <= AROUND:
         none = np.empty(0, np.int32)
         return DescriptorMatches(none, none, np.empty(0, np.float32))
-    logits = _session().run(None, filter_inputs(features0, features1, matches))[0]
+    logits = session_of(MATCH_FILTER).run(None, filter_inputs(features0, features1, matches))[0]
     kept = logits > 0
     wrong = 1 / (1 + np.exp(logits[kept]))
     return DescriptorMatches(matches.indices0[kept], matches.indices1[kept], wrong)
@@ -117,8 +112,3 @@ def nearest_rows(xy: np.ndarray) -> np.ndarray:
     # Each position's own row is moved to the end and dropped. If many positions coincide, the own
     # row may be missing, and the last of the other rows is dropped.
     return np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]
-
-
-@functools.cache
-def _session() -> Any:
-    return start_session(str(MATCH_FILTER))

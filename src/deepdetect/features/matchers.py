@@ -38,19 +38,17 @@ FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
 """FLANN's code for kd-trees, the number of trees, and the number of leaves that each query visits,
 as in the paper's code."""
 
-SWEEPS = 4
-"""Number of PatchMatch's sweeps over all queries, alternately down and up. Chosen by hand."""
+SWEEPS, BAND_HEIGHT_PX = 4, 96
+"""Number of PatchMatch's sweeps over all queries, alternately down and up, and height of the bands
+of the first image that its threads process. Chosen by hand."""
 
 OFFSETS_PX = (1, 4, 12)
 """PatchMatch tries, for each query, the shifted matches of queries at these distances in x or in y.
 The smallest distance is 1 px because dense keypoints are 1 px apart."""
 
-BAND_HEIGHT_PX = 96
-"""Height of the bands of the first image that PatchMatch's threads process. Chosen by hand."""
-
 SEARCH_SHRINK = 3
 """PatchMatch also tries random positions around the best match. The first radius is half the longer
-side of the image, and each further radius is the previous one divided by this number."""
+side of the image, and each further one the previous one divided by this number."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
 """Nearest neighbours of N queries: their rows in the base, (N, count) int32, and their distances,
@@ -94,7 +92,7 @@ def _search_both_ways(
         terms0 -= 2 * offset * queries.sum(1, dtype=np.float64)
     else:
         queries, base = (np.asarray(part, np.float32) for part in (queries, base))
-        session, factor = _product("float"), np.ascontiguousarray(base.T)
+        session, factor = session_of(PRODUCTS / "float.onnx"), np.ascontiguousarray(base.T)
     found = min(count + 1, len(base))  # one more, to detect ties within rounding errors
     rows = np.empty((len(queries), found), np.int32)
     squared = np.empty((len(queries), found), np.float32)
@@ -144,8 +142,9 @@ def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.
 
 
 @functools.cache
-def _product(name: str) -> Any:
-    return start_session(str(PRODUCTS / f"{name}.onnx"))
+def session_of(path: Path) -> Any:
+    """Return a session of a bundled ONNX file, always the same one."""
+    return start_session(str(path))
 
 
 @functools.cache
@@ -156,11 +155,11 @@ def _byte_product() -> tuple[Any, int]:
     base. On processors without VNNI, sums of such products saturate. There both matrices stay
     unsigned, and the offset is 0.
     """
-    session = _product("signed")
+    session = session_of(PRODUCTS / "signed.onnx")
     most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
     if (session.run(None, dict(zip("ab", most, strict=True)))[0] == 64 * 255 * 127).all():
         return session, 128
-    return _product("unsigned"), 0
+    return session_of(PRODUCTS / "unsigned.onnx"), 0
 
 
 def hamming_neighbours(

@@ -86,14 +86,10 @@ class TwoViewGeometry:
 
     def swapped(self) -> TwoViewGeometry:
         """Return the geometry from the second image to the first."""
-        return replace(self, matrix=_swapped(self.model, self.matrix))
-
-
-def _swapped(model: str, matrix: np.ndarray | None) -> np.ndarray | None:
-    if matrix is None or model != "homography":
-        return None if matrix is None else matrix.T
-    inverse = np.linalg.inv(matrix)
-    return inverse / inverse[2, 2]
+        if self.matrix is None or self.model != "homography":
+            return replace(self, matrix=None if self.matrix is None else self.matrix.T)
+        inverse = np.linalg.inv(self.matrix)
+        return replace(self, matrix=inverse / inverse[2, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,14 +234,26 @@ class Matches:
         for side in (0, 1):
             name = f"indices{side}"
             indices = getattr(self, name)
+            # Without matches, keypoints that are found on first access are not looked for.
+            keypoints: Any = getattr(self, f"keypoints{side}") if len(self) else ()
             if indices is None and len(self):
-                keypoints = getattr(self, f"keypoints{side}")
                 indices, distances = nearest_keypoints(
                     getattr(self, f"points{side}"), keypoints.xy, keypoints.image_size
                 )
                 indices[distances > MAX_KEYPOINT_DISTANCE_PX] = -1
             indices = numbers_of(name, () if indices is None else indices, None)
-            object.__setattr__(self, name, self._checked_indices(indices, side))
+            if indices.shape != (len(self),) or (indices.size and indices.dtype.kind not in "iu"):
+                raise OptionError(
+                    f"matches need one whole number per match in {name}, not {indices.dtype} "
+                    f"numbers of shape {indices.shape}"
+                )
+            count = len(keypoints)
+            if indices.size and not (indices.min() >= -1 and indices.max() < count):
+                raise OptionError(
+                    f"{name} must lie in [-1, {count - 1}], as there are {count} keypoints, not in "
+                    f"[{indices.min()}, {indices.max()}]"
+                )
+            object.__setattr__(self, name, indices.astype(np.int32))
 
     def __getstate__(self) -> dict[str, Any]:
         # The state that is pickled holds the keypoints, not functions that find them.
@@ -319,7 +327,11 @@ class Matches:
         kept = np.ones(len(self), bool)
         best_first = np.argsort(-self.scores, kind="stable")
         for side in (0, 1):
-            ends = _ends(getattr(self, f"points{side}"), getattr(self, f"indices{side}"))
+            ends = getattr(self, f"indices{side}").astype(np.int64)
+            without = np.flatnonzero(ends < 0)  # their pixels get negative numbers
+            pixels = np.floor(getattr(self, f"points{side}")[without] + np.float32(0.5))
+            pixels = np.unique(pixels.astype(np.int64), axis=0, return_inverse=True)[1]
+            ends[without] = -1 - pixels.reshape(-1)
             best = np.unique(ends[best_first], return_index=True)[1]
             is_best = np.zeros(len(self), bool)
             is_best[best_first[best]] = True
@@ -412,28 +424,3 @@ class Matches:
             f"Matches({len(self)} matches of {len(self.keypoints0)} and {len(self.keypoints1)} "
             f"keypoints, {np.count_nonzero(self.inliers)} inliers{told})"
         )
-
-    def _checked_indices(self, indices: np.ndarray, side: int) -> np.ndarray:
-        if indices.shape != (len(self),) or (indices.size and indices.dtype.kind not in "iu"):
-            raise OptionError(
-                f"matches need one whole number per match in indices{side}, not {indices.dtype} "
-                f"numbers of shape {indices.shape}"
-            )
-        if indices.size:
-            count = len(self.keypoints1 if side else self.keypoints0)
-            if not (indices.min() >= -1 and indices.max() < count):
-                raise OptionError(
-                    f"indices{side} must lie in [-1, {count - 1}], as there are {count} keypoints, "
-                    f"not in [{indices.min()}, {indices.max()}]"
-                )
-        return indices.astype(np.int32)
-
-
-def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Return numbers of the ends of matches: keypoint indices, or negative numbers for pixels."""
-    ends = indices.astype(np.int64)
-    without = np.flatnonzero(indices < 0)
-    if len(without):
-        pixels = np.floor(points[without] + np.float32(0.5)).astype(np.int64)
-        ends[without] = -1 - np.unique(pixels, axis=0, return_inverse=True)[1].reshape(-1)
-    return ends

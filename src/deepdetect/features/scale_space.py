@@ -11,14 +11,13 @@ from .._shared.opencv import cv2
 LAYERS = 3
 """Layers with keypoints per octave, as in Lowe (2004). Each multiplies sigma by 2^(1/3)."""
 
-BASE_SIGMA_PX = 1.6
-"""Sigma of the blur of the first image of an octave, in the octave's pixels, as in Lowe (2004)."""
+BASE_SIGMA_PX, CAMERA_SIGMA_PX = 1.6, 0.5
+"""Sigma of the blur of the first image of an octave, in the octave's pixels, and of the blur that
+the camera is assumed to have caused, as in Lowe (2004)."""
 
-CAMERA_SIGMA_PX = 0.5
-"""Sigma of the blur that the camera is assumed to have caused, in pixels, as in Lowe (2004)."""
-
-SIZE_PER_SIGMA = 2.0
-"""The size of a SIFT keypoint in OpenCV is this many times the sigma of its scale."""
+SIZE_PER_SIGMA, WINDOW_PER_SIGMA = 2.0, 1.5
+"""The size of a SIFT keypoint in OpenCV, and the sigma of the Gaussian window for its orientation,
+as in Lowe (2004), in sigmas of the keypoint's scale."""
 
 MIN_SIDE_PX = 8
 """Octaves are not used if a side of their images is shorter than this. Chosen by hand."""
@@ -55,12 +54,9 @@ def gaussian_layers(
     image = gray.astype(np.float32)
     sigma = CAMERA_SIGMA_PX
     if first_octave < 0:
-        height, width = image.shape
+        size = (2 * image.shape[1], 2 * image.shape[0])
         double = np.array([[2, 0, 0], [0, 2, 0]], np.float32)
-        border = cv2.BORDER_REFLECT_101
-        image = cv2.warpAffine(
-            image, double, (2 * width, 2 * height), flags=cv2.INTER_LINEAR, borderMode=border
-        )
+        image = cv2.warpAffine(image, double, size, borderMode=cv2.BORDER_REFLECT_101)
         sigma *= 2
     for octave in range(min(first_octave, 0), last_octave + 1):
         for layer in range(LAYERS + 1):
@@ -71,10 +67,6 @@ def gaussian_layers(
             yield octave, layer, image
         image = np.ascontiguousarray(image[::2, ::2])
         sigma = BASE_SIGMA_PX
-
-
-WINDOW_PER_SIGMA = 1.5
-"""Sigma of the Gaussian window for orientations, in sigmas of the keypoint, as in Lowe (2004)."""
 
 
 def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:

@@ -200,26 +200,26 @@ def _unpack(packed: np.ndarray, width: int) -> np.ndarray:
 
 def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -> np.ndarray:
     """Return a bit mask, packed along the rows, of pixels above the threshold and not ignored."""
-    height, width = maps.shape
     if ignore is not None:
         ignore = check_ignore(ignore, maps.shape)
     # A density may need all pixels except those with a probability of 0.
     threshold = options.threshold if options.density is None else 0.0
-    packed = np.empty((height, -(-width // 8)), np.uint8)
-    heatmap = maps.heatmap()
+    packed, heatmap = [], maps.heatmap()
     for rows in bands(maps.shape):
         passing = heatmap(rows) > threshold
         if ignore is not None:
             passing &= ~ignore[rows]
-        packed[rows] = np.packbits(passing, axis=1)
-    return packed
+        packed.append(np.packbits(passing, axis=1))
+    return np.concatenate(packed)
 
 
 def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions) -> np.ndarray:
     """Return the pixels that become keypoints, as a bit mask packed like `passing`."""
     height, width = ranking.shape
     radius = int(options.nms_radius)
-    count = _wanted_count(options, ranking.size)
+    shares = [] if options.density is None else [round(options.density * ranking.size)]
+    limits = [] if options.max_keypoints is None else [int(options.max_keypoints)]
+    count = min(shares + limits, default=None)
     if not radius and count is None:
         return passing
     ranks = ranking.ravel()
@@ -350,15 +350,6 @@ def without_frame(rgb: np.ndarray, ignore: np.ndarray | None) -> np.ndarray | No
     return ignore if not frame.any() else frame if ignore is None else frame | ignore
 
 
-def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
-    counts = []
-    if options.density is not None:
-        counts.append(round(options.density * pixels))
-    if options.max_keypoints is not None:
-        counts.append(int(options.max_keypoints))
-    return min(counts, default=None)
-
-
 def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:
     """Choose one random position in each grid cell; return the chosen rows of `xy`, ascending."""
     cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
@@ -404,10 +395,7 @@ def descending_order(values: np.ndarray) -> np.ndarray:
 
 
 def suppress_neighbors(
-    xy: np.ndarray,
-    scores: np.ndarray,
-    radius_px: float | np.ndarray,
-    max_count: int | None = None,
+    xy: np.ndarray, scores: np.ndarray, radius_px: float | np.ndarray, max_count: int | None = None
 ) -> np.ndarray:
     """Keep each point, from the best on, unless it is near a kept one; return the kept rows.
 

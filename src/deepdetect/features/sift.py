@@ -21,21 +21,16 @@ from .selection import spread_over_grid
 ROOT_SIFT: Final = "rootsift"
 """Value of `Keypoints.descriptor_type` for RootSIFT."""
 
-DENSE_SIZES_PX = (2.0, 8.0)
-"""Range of keypoint diameters, in pixels, that `dense_sift` supports."""
-
-MIN_DENSE_DENSITY = 0.02
-"""Keypoints per pixel above which `dense_sift` is faster than describing keypoints one by one."""
+DENSE_SIZES_PX, MIN_DENSE_DENSITY = (2.0, 8.0), 0.02
+"""Range of keypoint diameters, in pixels, that `dense_sift` supports, and keypoints per pixel above
+which it is faster than describing keypoints one by one."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
 
-CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
-"""SIFT's contrast thresholds, tried in this order until there are enough keypoints. Lowe's value is
-0.04. The thresholds apply to the contrast times the number of layers, as in OpenCV."""
-
-MIN_KEYPOINTS = 1000
-"""If there are fewer keypoints than this, the next lower threshold is tried. Chosen by hand."""
+CONTRAST_THRESHOLDS, MIN_KEYPOINTS = (0.04, 0.01, 0.0025), 1000
+"""SIFT's contrast thresholds, which apply to the contrast times the number of layers, as in OpenCV.
+The first is Lowe's. While there are fewer keypoints than the second value, the next is tried."""
 
 ROWS_AT_ONCE = 1024
 """This many descriptors are converted to RootSIFT at a time: they stay in the processor's cache."""
@@ -188,27 +183,16 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
             f"keypoints of an image of {width}x{height} pixels need its uint8 luma, of shape "
             f"{(height, width)}, not {gray.dtype} of shape {gray.shape}"
         )
-    if keypoints.sizes is None:
-        described = replace(keypoints, descriptors=sift_descriptors(gray, keypoints.xy))
+    xy, sizes, angles = keypoints.xy, keypoints.sizes, keypoints.angles
+    if sizes is None:
+        descriptors = sift_descriptors(gray, xy)
     else:
-        described = describe_scaled(gray, keypoints)
-    assert described.descriptors is not None
-    root = to_root_sift(described.descriptors)
-    return replace(described, descriptors=root, descriptor_type=ROOT_SIFT)
-
-
-def describe_scaled(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
-    """Return keypoints with SIFT descriptors at their own sizes and angles.
-
-    Unset angles become the dominant gradient orientations. Sizes not above 0 raise an OptionError.
-    """
-    xy, sizes = keypoints.xy, keypoints.sizes
-    assert sizes is not None
-    if not (sizes > 0).all():
-        raise OptionError("keypoints need sizes above 0 to be described")
-    angles = set_angles(gray, xy, sizes, keypoints.angles)
-    descriptors = scaled_sift_descriptors(gray, xy, sizes, angles)
-    return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type="sift")
+        if not (sizes > 0).all():
+            raise OptionError("keypoints need sizes above 0 to be described")
+        angles = set_angles(gray, xy, sizes, angles)
+        descriptors = scaled_sift_descriptors(gray, xy, sizes, angles)
+    root = to_root_sift(descriptors)
+    return replace(keypoints, angles=angles, descriptors=root, descriptor_type=ROOT_SIFT)
 
 
 def root_sift_descriptors(
@@ -240,11 +224,7 @@ def _square_root(start: int, stop: int, descriptors: np.ndarray) -> None:
 
 
 def correlation_distance(
-    first: np.ndarray,
-    rows0: np.ndarray,
-    second: np.ndarray,
-    rows1: np.ndarray,
-    mean: np.ndarray,
+    first: np.ndarray, rows0: np.ndarray, second: np.ndarray, rows1: np.ndarray, mean: np.ndarray
 ) -> np.ndarray:
     """Return 1 - correlation of K pairs of uint8 descriptors, (K,) float32.
 
@@ -263,10 +243,7 @@ def correlation_distance(
 
 Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
 
-DESCRIPTORS: dict[str, Descriptor] = {
-    "sift": sift_descriptors,
-    "rootsift": root_sift_descriptors,
-}
+DESCRIPTORS: dict[str, Descriptor] = {"sift": sift_descriptors, "rootsift": root_sift_descriptors}
 
 
 def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:

@@ -38,32 +38,24 @@ of pyramid levels. Corners move farther in the first round. Chosen by hand."""
 MIN_TRACKS = 15
 """A homography is fitted only if there are at least this many tracks. Chosen by hand."""
 
-TRACKING_ITERATIONS = 15
-TRACKING_STEP_PX = 0.02
-"""A corner has converged when a tracking step moves it by less than this. Chosen by hand."""
+TRACKING_ITERATIONS, TRACKING_STEP_PX = 15, 0.02
+"""Maximum number of steps that track a corner. It has converged when a step moves it by less than
+the second value. Chosen by hand."""
 
 MAX_ROUND_TRIP_PX = 0.3
 """A corner is tracked to the second image and back. The track is kept if it ends at less than this
 distance from its start. Chosen by hand."""
 
-CAUCHY_SCALE_PX = 1.0
+CAUCHY_SCALE_PX, IRLS_ITERATIONS = 1.0, 30
 """A track with this residual has half the weight of one without residual. Chosen by hand."""
 
-IRLS_ITERATIONS = 30
+ALIGNMENT_SIDE_PX, ALIGNMENT_SIGMA_PX, ALIGNMENT_ITERATIONS = 480, 1.0, 15
+"""Images are reduced to this longer side and blurred with this sigma before their pixels are
+aligned. Chosen by hand."""
 
-ALIGNMENT_SIDE_PX = 480
-"""Images are reduced to this longer side before their pixels are aligned. Chosen by hand."""
-
-ALIGNMENT_SIGMA_PX = 1.0
-"""The reduced copies are blurred with this sigma before they are aligned. Chosen by hand."""
-
-ALIGNMENT_ITERATIONS = 15
-
-SQUARES = 8
-"""Number of squares of the chessboard along the longer side of a large image. Chosen by hand."""
-
-STEP_PX = WINDOW_PX // 3
-"""Distance between the centres of the windows in which images are compared. Chosen by hand."""
+SQUARES, STEP_PX = 8, WINDOW_PX // 3
+"""Number of squares of the chessboard along the longer side of a large image, and distance between
+the centres of the windows in which images are compared. Chosen by hand."""
 
 Fit = Callable[[np.ndarray], "np.ndarray | None"]
 """A function that fits a (3, 3) correction of a homography to the pixels in an (H, W) bool mask. It
@@ -167,20 +159,16 @@ def _fit_to_corners(
 
 def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray) -> Fit:
     (first, scale), (second, _) = (downscale(gray, ALIGNMENT_SIDE_PX) for gray in (gray0, warped))
-    normalised = [
-        normalise_local_contrast(gaussian_blur(gray, ALIGNMENT_SIGMA_PX))
-        for gray in (first, second)
-    ]
+    blurred = (gaussian_blur(gray, ALIGNMENT_SIGMA_PX) for gray in (first, second))
+    normalised = [*map(normalise_local_contrast, blurred)]
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ALIGNMENT_ITERATIONS, 1e-5)
 
     def align(used: np.ndarray) -> np.ndarray | None:
         mask = (used & valid_mask).astype(np.uint8)
         mask = cv2.resize(mask, first.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        start = np.eye(3, dtype=np.float32)
+        start, kind = np.eye(3, dtype=np.float32), cv2.MOTION_HOMOGRAPHY
         try:
-            correction = cv2.findTransformECC(
-                *normalised, start, cv2.MOTION_HOMOGRAPHY, criteria, mask, 1
-            )[1]
+            correction = cv2.findTransformECC(*normalised, start, kind, criteria, mask, 1)[1]
         except cv2.error:  # the alignment does not converge, or there is nothing to correlate
             return None
         return scaled_homography(correction.astype(np.float64), 1 / scale, 1 / scale)

@@ -20,11 +20,9 @@ UNITS = {
 EAST_NORTH_UP = "x east, y north, z up"
 """`PointCloud.frame` of a georeferenced cloud. Any other value is the name of a camera."""
 
-BOX_PERCENTILE = 1.0
-"""This percentage of the points lies beyond each face of the robust box. Chosen by hand."""
-
-MAX_ANGULAR_SPACING = 0.02
-"""Maximum of `angular_spacing` in radians; it limits the size of drawn points. Chosen by hand."""
+BOX_PERCENTILE, MAX_ANGULAR_SPACING = 1.0, 0.02
+"""This percentage of the points lies beyond each face of the robust box. The maximum of
+`angular_spacing`, in radians, limits the size of drawn points. Chosen by hand."""
 
 
 @suggest_keywords
@@ -129,10 +127,8 @@ def robust_box(cloud: PointCloud) -> RobustBox:
     A few distant outliers hardly change it. An empty cloud raises an OptionError.
     """
     require_points(cloud)
-    low, high = np.percentile(
-        cloud.points.astype(np.float64), (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0
-    )
-    return RobustBox(low, high)
+    ends = BOX_PERCENTILE, 100 - BOX_PERCENTILE
+    return RobustBox(*np.percentile(cloud.points.astype(np.float64), ends, axis=0))
 
 
 def angular_spacing(cloud: PointCloud) -> float:
@@ -145,9 +141,8 @@ def angular_spacing(cloud: PointCloud) -> float:
     ahead = cloud.points[cloud.points[:, 2] > 0]
     if not len(ahead):
         return MAX_ANGULAR_SPACING
-    seen = np.percentile(
-        ahead[:, :2] / ahead[:, 2:], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0
-    )
+    ends = BOX_PERCENTILE, 100 - BOX_PERCENTILE
+    seen = np.percentile(ahead[:, :2] / ahead[:, 2:], ends, axis=0)
     width, height = ((seen[1] - seen[0]) / (1 - 2 * BOX_PERCENTILE / 100)).tolist()
     spacing = min(MAX_ANGULAR_SPACING, float(np.sqrt(width * height / len(ahead))))
     return spacing or MAX_ANGULAR_SPACING

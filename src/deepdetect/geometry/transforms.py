@@ -115,9 +115,8 @@ def score_errors(errors: np.ndarray) -> dict[str, float]:
     """
     evaluated = int(np.isfinite(errors).sum())
     correct = int((errors <= TOLERANCE_PX).sum())
-    precision = correct / evaluated if evaluated else 0.0
     counts = {"matches": len(errors), "evaluated": evaluated, "correct": correct}
-    return {**counts, "precision": precision}
+    return counts | {"precision": correct / evaluated if evaluated else 0.0}
 
 
 def translation_matrix(x: float, y: float) -> np.ndarray:

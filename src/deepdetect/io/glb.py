@@ -40,19 +40,15 @@ def write_glb(
     colors = np.full((len(cloud), 4), 65535, "<u2")
     colors[:, :3] = np.rint(65535 * srgb_to_linear()).astype("<u2")[cloud.colors]
     corners = np.ascontiguousarray(np.empty(0) if faces is None else faces, "<u4")
-    text = json.dumps(
-        _tree(cloud, positions, metadata, corners.size), separators=(",", ":")
-    ).encode("ascii")
+    tree = _tree(cloud, positions, metadata, corners.size)
+    text = json.dumps(tree, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
     size = positions.nbytes + colors.nbytes + corners.nbytes  # a multiple of 4
+    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + size, len(text), b"JSON")
     with path.open("wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + size))
-        file.write(struct.pack("<I4s", len(text), b"JSON"))
-        file.write(text)
-        file.write(struct.pack("<I4s", size, b"BIN\0"))
-        positions.tofile(file)
-        colors.tofile(file)
-        corners.tofile(file)
+        file.write(head + text + struct.pack("<I4s", size, b"BIN\0"))
+        for values in (positions, colors, corners):
+            values.tofile(file)
 
 
 def _tree(
@@ -64,18 +60,12 @@ def _tree(
     primitive |= {"mode": TRIANGLES, "indices": 2} if corners else {}
     unit = "metres" if cloud.unit in ("mm", "m") else f"{UNITS[cloud.unit]}, of unknown length"
     rough = {"metallicFactor": 0, "roughnessFactor": 1}
+    frame = "x east, y up, z south"
+    if cloud.frame != EAST_NORTH_UP:
+        frame = f"origin at the {cloud.frame}, x right, y up, z backward"
+    extras = {"unit": unit, "frame": frame, "notes": dict(metadata)}
     return {
-        "asset": {
-            "version": "2.0",
-            "generator": "deepdetect",
-            "extras": {
-                "unit": unit,
-                "frame": "x east, y up, z south"
-                if cloud.frame == EAST_NORTH_UP
-                else f"origin at the {cloud.frame}, x right, y up, z backward",
-                "notes": dict(metadata),
-            },
-        },
+        "asset": {"version": "2.0", "generator": "deepdetect", "extras": extras},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "point cloud"}],

@@ -24,22 +24,18 @@ DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
 """The page's field of view as the tangent of its half angle: the default, and the allowed range.
 Chosen by hand."""
 
-MAX_LEVEL = 65535
-"""Positions along each axis are stored as integers from 0 to this number, in 16 bits."""
-
-MARGIN = 1.0
-"""Points are left out if they lie outside the robust box by more than this times its size, because
-a few distant points would make the quantisation steps coarse. Chosen by hand."""
+MAX_LEVEL, MARGIN = 65535, 1.0
+"""Positions along each axis are stored as integers from 0 to the first number, in 16 bits. Points
+outside the robust box by more than the second times its size are left out, because a few distant
+ones would make the steps coarse. Chosen by hand."""
 
 CAMERA_SIZE = 0.35
-"""A camera is drawn as a pyramid. Its depth is this fraction of the median distance from a camera
-to the nearest other one. Chosen by hand."""
+"""Depth of the pyramids that stand for cameras, in median distances from a camera to the nearest
+other one. Chosen by hand."""
 
-OVERVIEW_RADIANS = (0.4, 0.5)
-"""Azimuth and elevation of the first view of a page with cameras. Chosen by hand."""
-
-OVERVIEW_POINTS = 2000
-"""The first view is fitted to about this many points, for speed. Chosen by hand."""
+OVERVIEW_RADIANS, OVERVIEW_POINTS = (0.4, 0.5), 2000
+"""Azimuth and elevation of the first view of a page with cameras, and the approximate number of
+points to which it is fitted, for speed. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +54,7 @@ class PagePoints:
 
 
 def write_html_page(
-    cloud: PointCloud,
-    path: Path,
-    metadata: Mapping[str, str],
-    cameras: Sequence[PosedView] = (),
+    cloud: PointCloud, path: Path, metadata: Mapping[str, str], cameras: Sequence[PosedView] = ()
 ) -> None:
     """Write the page: 12 bytes per point, as 16-bit positions and 8-bit colours in base64.
 
@@ -121,7 +114,7 @@ def camera_lines(cameras: Sequence[PosedView]) -> np.ndarray:
 
 
 def _description(
-    cloud: PointCloud, stored: PagePoints, cameras: Sequence[PosedView] = ()
+    cloud: PointCloud, stored: PagePoints, cameras: Sequence[PosedView]
 ) -> dict[str, object]:
     box = robust_box(cloud)
     corners = np.stack([stored.offset, stored.offset + MAX_LEVEL * stored.step])

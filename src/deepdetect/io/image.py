@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from .image_file import (
 )
 from .tiff import TIFF_STARTS, page_numbers, read_tiff
 
+Found = TypeVar("Found")
 Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
 
@@ -242,25 +243,24 @@ def _load(
     return rgb
 
 
-def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
-    """Load the images of a list, tuple or batch one by one; yield the index and pixels of each."""
-    batch_length(images)
-    with one_range(images, channels) as reading:
-        pass
-    for number, image in enumerate(images):
-        with image_named(number), read_with(reading):
-            pixels = load_pixels(image, channels)
-        yield number, pixels
-        del pixels
-
-
-def batch_length(images: Images) -> int:
-    """Return the number of images of a batch; raise an OptionError for anything else."""
+def found_in_each(
+    images: Images, channels: Channels, ignore: Any, find: Callable[[np.ndarray, Any], Found]
+) -> list[Found]:
+    """Load the images of a list, tuple or batch one by one; return `find(pixels, mask)` of each."""
     if not isinstance(images, (list, tuple)) and getattr(images, "ndim", 0) != 4:
         raise OptionError(
             "a batch is a list or a 4-D array: give one image to the method without _batch"
         )
-    return len(images)
+    masks, found = ignore_masks(ignore, len(images)), list[Found]()
+    with one_range(images, channels) as reading:
+        pass
+    for number, image in enumerate(images):
+        with image_named(number):
+            with read_with(reading):
+                pixels = load_pixels(image, channels)
+            found.append(find(pixels, masks[number]))
+        del pixels
+    return found
 
 
 @contextmanager

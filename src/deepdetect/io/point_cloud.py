@@ -17,9 +17,6 @@ from .html_viewer import write_html_page
 Metadata = Mapping[str, str | int | float]
 PointCloudWriter = Callable[[PointCloud, Path, Mapping[str, str]], None]
 
-VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-VERTEX_WITH_NORMAL = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
-
 
 def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
     """Write binary PLY (Turk, 1994): float x y z, uchar red green blue; 15 bytes per point.
@@ -28,12 +25,12 @@ def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
     makes 27 bytes per point. Frame, unit and metadata become comments, with "?" for each character
     outside ASCII. PLY libraries do not write comments, so none is used.
     """
-    vertices = np.empty(len(cloud), VERTEX if cloud.normals is None else VERTEX_WITH_NORMAL)
-    names = "x y z" if cloud.normals is None else "x y z nx ny nz"
-    if cloud.normals is not None:
-        vertices["normal"] = cloud.normals
-    vertices["xyz"] = cloud.points
-    vertices["rgb"] = cloud.colors
+    columns = {"x y z": cloud.points, "nx ny nz": cloud.normals}
+    vectors = {names: values for names, values in columns.items() if values is not None}
+    kinds = [(names, "<f4", 3) for names in vectors] + [("rgb", "u1", 3)]
+    vertices = np.empty(len(cloud), kinds)
+    for names, values in {**vectors, "rgb": cloud.colors}.items():
+        vertices[names] = values
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -42,7 +39,7 @@ def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
         f"comment frame: {cloud.axes}",
         *(f"comment {name}: {text}" for name, text in metadata.items()),
         f"element vertex {len(cloud)}",
-        *(f"property float {axis}" for axis in names.split()),
+        *(f"property float {axis}" for names in vectors for axis in names.split()),
         *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
         "end_header\n",
     ]

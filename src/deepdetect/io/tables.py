@@ -11,13 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import (
-    ImageError,
-    InvalidFileError,
-    MissingFileError,
-    OptionError,
-    first_line,
-)
+from .._shared.errors import ImageError, InvalidFileError, MissingFileError, OptionError, first_line
 from .._shared.options import suggest_keywords
 from .._shared.records import save_arrays
 from ..features.keypoints import Keypoints
@@ -26,10 +20,7 @@ from ..features.matches import Evidence, Matches, TwoViewGeometry
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
 """These attributes of keypoints may be None. An npz file contains those that are not."""
 
-MATCH_VALUES = (
-    *("points0", "points1", "scores", "inliers"),
-    *("subpixel", "indices0", "indices1"),
-)
+MATCH_VALUES = ("points0", "points1", "scores", "inliers", "subpixel", "indices0", "indices1")
 """An npz file contains these attributes of `Matches`, in addition to keypoints and geometry."""
 
 CSV_ROWS = 100_000
@@ -129,24 +120,16 @@ def load_matches(path: str | Path) -> Matches:
         DeepDetectError: the file is missing or has other content.
     """
     with _arrays_in(path, "matches") as arrays:
-        keypoints = [
-            Keypoints(
-                arrays[f"keypoints{side}"],
-                arrays[f"keypoint_scores{side}"],
-                arrays[f"image_size{side}"],
-            )
-            for side in (0, 1)
-        ]
+        names = "keypoints", "keypoint_scores", "image_size"
+        keypoints = [Keypoints(*(arrays[f"{name}{side}"] for name in names)) for side in (0, 1)]
         geometry = None
         if "model" in arrays:
             evidence = Evidence(**{each.name: arrays[each.name] for each in fields(Evidence)})
             values = {name: arrays[name] for name in ("model", "matrix", "scene", "confidence")}
             geometry = TwoViewGeometry(**values, evidence=evidence)
+        values = {name: arrays[name] for name in MATCH_VALUES}
         return Matches(
-            keypoints0=keypoints[0],
-            keypoints1=keypoints[1],
-            geometry=geometry,
-            **{name: arrays[name] for name in MATCH_VALUES},
+            **values, keypoints0=keypoints[0], keypoints1=keypoints[1], geometry=geometry
         )
 
 

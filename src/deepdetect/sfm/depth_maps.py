@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -25,43 +25,28 @@ from ..matching.stereo.sgm import LANES, OUTSIDE_COST, WRONG_PLACE_BITS, aggrega
 from .colmap import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel
 
-MATCHED_NEIGHBOURS = 4
-"""An image is matched with up to this number of neighbours; each takes time. Chosen by hand."""
+MATCHED_NEIGHBOURS, NEIGHBOURS, MIN_COMMON_POINTS = 4, 8, 30
+"""An image is matched with at most the first number of neighbours, because each takes time. Its
+depth map is compared with those of at most the second number. A neighbour must share at least the
+third number of sparse points with it. Chosen by hand."""
 
-NEIGHBOURS = 8
-"""A depth map is compared with those of at most this number of neighbours. Chosen by hand."""
-
-MIN_COMMON_POINTS = 30
-"""A neighbour must share at least this number of sparse points with the image. Chosen by hand."""
-
-IDEAL_ANGLE_DEG = 5.0
+IDEAL_ANGLE_DEG, MAX_ANGLE_DEG = 5.0, 30.0
 """Neighbours are ranked by the sparse points that they share with the image. A point whose two
-lines of sight form a smaller angle counts less, because its depth is uncertain. Chosen by hand."""
+lines of sight form a smaller angle counts less, because its depth is uncertain, and one with a
+larger angle, because surfaces look different. Chosen by hand."""
 
-MAX_ANGLE_DEG = 30.0
-"""Neighbours are ranked by the sparse points that they share with the image. A point whose two
-lines of sight form a larger angle counts less, because surfaces look different. Chosen by hand."""
+MAX_SIDE_PX, CACHED_IMAGES = 2000, 16
+"""Images whose longer side exceeds this are scaled down to it, which limits time and memory. A
+process caches this number of undistorted images, because successive images share neighbours."""
 
-MAX_SIDE_PX = 2000
-"""Images whose longer side exceeds this are scaled down to it, which limits time and memory."""
+SMALL_SCALE, MAX_VOLUME = 0.5, 3e7
+"""Images are scaled by at most this for semi-global matching, because halving it divides the time
+by 8, and have at most this number of costs (pixels times inverse depths) there, to save memory."""
 
-CACHED_IMAGES = 16
-"""A process caches this number of undistorted images: successive images share neighbours."""
-
-SMALL_SCALE = 0.5
-"""Images are scaled by at most this for semi-global matching. Halving it divides the time by 8."""
-
-MAX_VOLUME = 3e7
-"""Limit for the costs (pixels times inverse depths) in semi-global matching, to save memory."""
-
-TAIL_FRACTION, DEPTH_MARGIN = 0.002, 0.2
-"""The search range spans the inverse depths of the sparse points. `TAIL_FRACTION` of the points is
-ignored at each end, because these may be wrong. The range is then extended at each end by
-`DEPTH_MARGIN` times its length. Chosen by hand."""
-
-MIN_FAR = 0.1
-"""The smallest inverse depth that is searched is at least this fraction of the smallest one of the
-sparse points, so that it stays above 0. Chosen by hand."""
+TAIL_FRACTION, DEPTH_MARGIN, MIN_FAR = 0.002, 0.2, 0.1
+"""The search range spans the inverse depths of the sparse points, without a `TAIL_FRACTION` at each
+end, which may be wrong. It is then extended at each end by `DEPTH_MARGIN` times its length, but not
+below `MIN_FAR` times the smallest inverse depth, so that it stays above 0. Chosen by hand."""
 
 MAX_APPROACH = 0.5
 """The search aligns all images at one depth of the first image. The depth is so large that no other
@@ -75,41 +60,30 @@ SAME_SURFACE_PX = 1.0
 """Two inverse depths belong to one surface if their matches in the downscaled images of the search
 are at most this far apart."""
 
-FIT_RADIUS_PX = 3
-"""Planes are fitted to the downscaled depth map in windows of this radius. Chosen by hand."""
-
-FIT_TOLERANCES_PX = (4, 2, 1)
-"""Tolerances of three successive plane fits, in steps of the search. The first one is wide, so that
-planes that begin frontal can become as steep as the ground. Chosen by hand."""
-
-MIN_FITTED = 12
-"""A plane must fit at least this number of pixels: smaller patches are wrong. Chosen by hand."""
+FIT_RADIUS_PX, FIT_TOLERANCES_PX, MIN_FITTED = 3, (4, 2, 1), 12
+"""Planes are fitted to the downscaled depth map three times, in windows of this radius, to at least
+`MIN_FITTED` pixels, as smaller patches are wrong. The first tolerance, in steps of the search, is
+wide, so that planes that begin frontal can become as steep as the ground. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
 """Radius of the compared windows, and spacing of the pixels read in them. Chosen by hand."""
 
-BLUR_SIGMA_PX = 1.0
-"""Sigma of the blur that lets the pixels read in a window represent those between them."""
-
-NOISE_LEVELS = 1.0
-"""Assumed noise of a pixel in grey levels: weaker gradients move no depth. Chosen by hand."""
+BLUR_SIGMA_PX, NOISE_LEVELS = 1.0, 1.0
+"""Sigma of the blur that lets the pixels read in a window represent those between them, and assumed
+noise of a pixel in grey levels: weaker gradients move no depth. Chosen by hand."""
 
 JUMPS = (16, 8, 4, 2, 1)
 """A pixel tries the planes of pixels at this distance in the depth map, one distance in each of
 five passes. A plane can thus spread over 31 pixels."""
 
-SURE_CORRELATION = 0.9
-"""A pixel whose window correlates this well tries no other plane, to save time. Chosen by hand."""
+SURE_CORRELATION, MIN_CORRELATION = 0.9, 0.5
+"""A pixel whose window correlates this well tries no other plane, to save time. A neighbour refines
+a depth only if the windows correlate at least as well as the second value. Chosen by hand."""
 
-MIN_CORRELATION = 0.5
-"""A neighbour refines a depth only if the windows correlate at least this well. Chosen by hand."""
-
-SMOOTHING_RADII = (4, 3)
-"""Planes are refined twice. After each refinement they are smoothed by a fit in windows of this
-radius, in pixels of the depth map. Chosen by hand."""
-
-MIN_WEIGHT = 0.02
-"""Weight of untextured pixels in smoothing. Half of the textured pixels have weights above 0.5."""
+SMOOTHING_RADII, MIN_WEIGHT = (4, 3), 0.02
+"""Planes are refined twice, and each time smoothed by a fit in windows of this radius, in pixels of
+the depth map. There untextured pixels have the second value as weight, and half of the textured
+ones more than 0.5. Chosen by hand."""
 
 MIN_VIEWS = 3
 """A depth is kept if at least this number of images agree on it, its own included: a third image
@@ -200,10 +174,8 @@ def _search(
     volume = count * grays[0].size * SMALL_SCALE**2
     scale = SMALL_SCALE * min(1.0, (MAX_VOLUME / volume) ** (1 / 3))
     small = [_scaled(view, scale) for view in views]
-    copies = [
-        cv2.resize(gray, view.camera.size, interpolation=cv2.INTER_AREA)
-        for gray, view in zip(grays, small, strict=True)
-    ]
+    resized = partial(cv2.resize, interpolation=cv2.INTER_AREA)
+    copies = [*map(resized, grays, (view.camera.size for view in small))]
     count = -(-math.ceil(count * scale / SMALL_SCALE) // LANES) * LANES
     inverse = np.linspace(*searched, count)
     own = copies[0]
@@ -220,12 +192,8 @@ def _search(
         warps.append(warp)
     first = np.floor(corners.min(axis=(0, 1, 3))).clip(-size, 0).astype(np.int64) - 1
     last = np.ceil(corners.max(axis=(0, 1, 3))).clip(size, 2 * size).astype(np.int64) + 1
-    words = np.stack(
-        [
-            _warped_census(copy, warp, first, last)
-            for copy, warp in zip(copies[1:], warps, strict=True)
-        ]
-    )
+    pairs = zip(copies[1:], warps, strict=True)
+    words = np.stack([_warped_census(*pair, first, last) for pair in pairs])
     tables = []
     for axis in (0, 1):
         along = np.linspace(corners[:, 0, axis], corners[:, 1, axis], size[axis], axis=-1)
@@ -395,12 +363,10 @@ def _undistorted(
 
 def limited_view(view: PosedView) -> PosedView:
     """Return a view, scaled down if its longer side exceeds `MAX_SIDE_PX`."""
-    return _scaled(view, min(1.0, MAX_SIDE_PX / max(view.camera.size)))
+    longest = max(view.camera.size)
+    return view if longest <= MAX_SIDE_PX else _scaled(view, MAX_SIDE_PX / longest)
 
 
 def _scaled(view: PosedView, scale: float) -> PosedView:
-    if scale == 1:
-        return view
-    width, height = view.camera.size
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return replace(view, camera=view.camera.scaled(size))
+    width, height = (max(1, round(side * scale)) for side in view.camera.size)
+    return replace(view, camera=view.camera.scaled((width, height)))

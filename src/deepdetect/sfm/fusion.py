@@ -13,12 +13,10 @@ from .._shared.opencv import cv2
 from ..geometry.camera import PosedView
 from .depth_maps import MIN_VIEWS, relative_projections
 
-MAX_ERROR_PX = 1.0
-"""A neighbour agrees with a pixel's depth if the neighbour's own surface point reprojects to within
-this distance of the pixel. Chosen by hand; COLMAP's fusion allows 2 px."""
-
-MAX_DEPTH_DIFFERENCE = 0.01
-"""Inverse depths agree if they differ by at most this fraction. COLMAP's fusion also allows 1 %."""
+MAX_ERROR_PX, MAX_DEPTH_DIFFERENCE = 1.0, 0.01
+"""A neighbour agrees with a pixel's depth if its own surface point reprojects to within this
+distance of the pixel, where COLMAP's fusion allows 2 px, and its inverse depth differs by at most
+this fraction, as in COLMAP."""
 
 MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
 """A pixel becomes a point if `ENOUGH_VIEWS` images agree on its depth, or if all images whose frame
@@ -38,13 +36,10 @@ FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
 """Pixels within `FILLED_RADIUS_PX` of the middle of their surface need only `MIN_FILLED_VIEWS`
 images that agree, because other images may not show this part of it. Chosen by hand."""
 
-MIN_TRIANGULATION_DEG = 1.0
+MIN_TRIANGULATION_DEG, DUPLICATE_DEPTH = 1.0, 0.01
 """A point is kept only if the line of sight of at least one image that agrees on it differs by this
-angle from that of the reference image. Chosen by hand."""
-
-DUPLICATE_DEPTH = 0.01
-"""A point is dropped if an earlier one projects to the same pixel and their depths differ by at
-most this fraction. Chosen by hand."""
+angle from that of the reference image, and if no earlier point projects to the same pixel with a
+depth that differs by at most the fraction. Chosen by hand."""
 
 DENSE_POINT = np.dtype(
     [

@@ -22,7 +22,7 @@ from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.selection import SelectionOptions
-from ..geometry.camera import Calibration, Camera, PosedView, check_camera_file
+from ..geometry.camera import Calibration, Camera, check_camera_file
 from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.image import one_range
@@ -44,11 +44,9 @@ from .result import MultiViewReconstruction
 from .splat import write_transforms
 from .stages import WORK, MultiViewOptions, Stages, check_images
 
-MAX_KEYPOINTS = 8192
-"""An image gets at most this number of keypoints by default. Chosen by hand."""
-
-MIN_KEYPOINTS = 15
-"""Images with fewer keypoints are left out, because they cannot be matched. Chosen by hand."""
+MIN_KEYPOINTS, MAX_KEYPOINTS = 15, 8192
+"""Images with fewer keypoints are left out, because they cannot be matched. By default, an image
+gets at most the second number. Chosen by hand."""
 
 
 @suggest_keywords
@@ -106,10 +104,8 @@ def reconstruct_many(
     target = Path(output)
     control = _check_arguments(images, target, calibration, focal_px, options)
     detector = PointDetector(MAX_KEYPOINTS) if detector is None else detector
-    if overwrite:
-        work = target / WORK
-        if any(work.glob("features.h5*")):  # else it is another program's folder
-            shutil.rmtree(work, ignore_errors=True)
+    if overwrite and any((target / WORK).glob("features.h5*")):  # else another program's folder
+        shutil.rmtree(target / WORK, ignore_errors=True)
     stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
@@ -162,12 +158,13 @@ def _reconstruct(
             dense["points"] = place.similarity.apply(dense["points"])
             dense["normals"] = dense["normals"] @ place.similarity.rotation.T
         views = dict(sorted(sparse.views.items()))
+        left = (tuple(sorted(names & unregistered.keys())) for names in components)
         found = MultiViewReconstruction(
             georeference=place,
             views=views,
             intrinsics={name: sparse.images[name].intrinsics for name in views},
             unregistered=dict(sorted(unregistered.items())),
-            components=_without_registered(components, unregistered),
+            components=(*sorted((n for n in left if len(n) > 1), key=len, reverse=True),),
             reference=reference,
             sparse=PointCloud(sparse.points, sparse.colors, *unit),
             sparse_errors=sparse.errors.astype(np.float32),
@@ -273,17 +270,16 @@ def _write(
     }
     save_point_cloud(found.cloud, output / "model.ply", notes)
     save_point_cloud(found.cloud, output / "model.glb", notes)
+    # The page shows the points and cameras in the frame of the reference.
+    view, cloud = found.views[found.reference], found.cloud
+    points = cloud.points @ view.rotation.T + view.translation
+    page = PointCloud(points, cloud.colors, cloud.unit, f"camera of {view.name}")
+    cameras = [each.relative_to(view) for each in found.views.values()]
     with atomic_path(output / "model.html") as path:
-        page, cameras = _seen_from(found.views[found.reference], found)
         write_html_page(page, path, notes, cameras)
     images = {name: (folder / name).resolve() for name in found.views}
-    write_transforms(
-        output / "transforms.json",
-        found.views,
-        found.intrinsics,
-        {"file_path": images},
-        output / "model.ply",
-    )
+    cameras_of = found.views, found.intrinsics, {"file_path": images}
+    write_transforms(output / "transforms.json", *cameras_of, output / "model.ply")
     values = {**found.summary(), "files": [str(path) for path in found.files]}
     with atomic_path(output / "model.json") as path:
         path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
@@ -295,16 +291,6 @@ def _write(
             failed.append(str(error))
     if failed:
         raise ReconstructionError("; ".join(failed) + " (all other files were written)")
-
-
-def _seen_from(
-    view: PosedView, found: MultiViewReconstruction
-) -> tuple[PointCloud, list[PosedView]]:
-    """Return the points and cameras, in the frame of the camera `view`, for the HTML viewer."""
-    frame = f"camera of {view.name}"
-    points = found.cloud.points @ view.rotation.T + view.translation
-    cameras = [each.relative_to(view) for each in found.views.values()]
-    return PointCloud(points, found.cloud.colors, found.cloud.unit, frame), cameras
 
 
 def _why_unregistered(
@@ -323,11 +309,3 @@ def _why_unregistered(
             "in between"
         )
     return "it matches no other image: it shows something else, or was taken from too far away"
-
-
-def _without_registered(
-    components: Iterable[frozenset[str]], unregistered: Iterable[str]
-) -> tuple[tuple[str, ...], ...]:
-    """Return the unregistered images in each component, if two or more, largest component first."""
-    left = [tuple(sorted(names & frozenset(unregistered))) for names in components]
-    return tuple(sorted((names for names in left if len(names) > 1), key=len, reverse=True))

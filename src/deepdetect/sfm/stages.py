@@ -66,8 +66,9 @@ from .misplaced import correct_places
 from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
-MAX_EXHAUSTIVE = 50
-"""The choice "auto" matches all pairs of images if there are at most this many. Chosen by hand."""
+MAX_EXHAUSTIVE, COMPARED_IMAGES = 50, 16
+"""The choice "auto" matches all pairs of images if there are at most the first number. An overlay
+is looked for in the second number of images, the first by name. Chosen by hand."""
 
 WORK = "work"
 """Name of the folder of intermediate results, inside the output folder."""
@@ -135,11 +136,7 @@ class MultiViewOptions:
         check_name("mapper", self.mapper, ("incremental", "global"))
         if "mesh" in self.formats and not self.dense:
             raise OptionError("the format 'mesh' needs dense points: leave out `dense=False`")
-        check_ranges(
-            self,
-            counts=("stride_px",),
-            fractions=("min_motion",),
-        )
+        check_ranges(self, counts=("stride_px",), fractions=("min_motion",))
 
     def pair_choice(self, count: int) -> str:
         """Return the choice of the pairs of `count` images, with "auto" replaced by its meaning."""

@@ -24,32 +24,22 @@ from ..reconstruction.subpixel import align_patches, spread_corners
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .mapping import RegisteredImage, SparseModel, read_sparse_model
 
-PATCH_RADIUS_PX = 6
-"""Radius of the patches that are aligned. Chosen by hand."""
-
-MAX_SHIFT_PX = 2.5
-"""Alignment moves a patch at most this far from the projection of its point. Chosen by hand."""
+PATCH_RADIUS_PX, MAX_SHIFT_PX = 6, 2.5
+"""Radius of the patches that are aligned, and the largest distance that alignment moves them from
+the projections of their points. Chosen by hand."""
 
 BLUR_SIGMA_PX = 0.7
 """Images are blurred with this sigma before patches are aligned. Without the blur, cubic
 interpolation dampens noise by an amount that depends on the sub-pixel position."""
 
-MIN_FACING = 0.3
-"""A patch of a surface is searched for in an image only if the cosine of the angle between the
-surface's normal and the direction to the camera exceeds this. Chosen by hand."""
+MIN_FACING, MAX_GROWTH, MIN_COMMON_POINTS = 0.3, 7.0, 10
+"""A patch is searched for in another image only if the cosine of the angle between its normal and
+the direction to that camera exceeds the first value, its area there differs by less than the second
+factor, and the images share at least the last number of points. Chosen by hand."""
 
-MAX_GROWTH = 7.0
-"""A patch is searched for in another image only if its area there differs from its own area by less
-than this factor. Chosen by hand."""
-
-MIN_COMMON_POINTS = 10
-"""Patches are aligned only between images that share this number of points. Chosen by hand."""
-
-DENSE_CELLS = 4500
-"""Each of this number of grid cells of an image begins at most one dense track. Chosen by hand."""
-
-MIN_DISTANCE_PX = 3
-"""A new track must begin farther than this from all earlier tracks in its image. Chosen by hand."""
+DENSE_CELLS, MIN_DISTANCE_PX = 4500, 3
+"""Each of this number of grid cells of an image begins at most one dense track, farther than this
+from all earlier tracks in the image. Chosen by hand."""
 
 MIN_DENSE_VIEWS = 3
 """A dense track needs at least this number of images: with two, no third one checks the match."""
@@ -225,13 +215,10 @@ class _Tracks:
             & (growth < MAX_GROWTH)
             & ((start[:, :2] >= 0) & (start[:, :2] < other.intrinsics.size)).all(axis=1)
         )
+        grays = self.read(image.view.name)[1], self.read(other.view.name)[1]
+        given = pixels[rows], np.ascontiguousarray(start[rows, :2]), affinities[rows]
         xy, converged = align_patches(
-            (self.read(image.view.name)[1], self.read(other.view.name)[1]),
-            pixels[rows],
-            np.ascontiguousarray(start[rows, :2]),
-            affinities[rows],
-            radius_px=PATCH_RADIUS_PX,
-            max_shift_px=MAX_SHIFT_PX,
+            grays, *given, radius_px=PATCH_RADIUS_PX, max_shift_px=MAX_SHIFT_PX
         )
         return rows[converged], xy[converged]
 

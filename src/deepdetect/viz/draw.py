@@ -9,12 +9,9 @@ import numpy as np
 
 from .._shared.opencv import cv2
 
-MAX_CIRCLES = 5000
-"""More keypoints than this are drawn as single pixels, because circles would cover the image."""
-
-LEAST_RADIUS_PX = 2.0
-"""Minimum radius of a keypoint's circle, in pixels. Keypoints without a size get a radius one pixel
-larger. Chosen by hand."""
+MAX_CIRCLES, LEAST_RADIUS_PX = 5000, 2.0
+"""More keypoints than this are drawn as single pixels, because circles would cover the image. The
+second number is the minimum radius of a circle; keypoints without a size get one pixel more."""
 
 PICTURE_SIDE_PX = 2000
 """Longest side of a visualisation, in pixels. A JPEG of it then takes less than two megabytes."""
@@ -33,12 +30,9 @@ LEAST_DEPTH_LEVEL = 0.2
 """The farthest depth has this level (0 to 1) of the colour scale, because darker colours look like
 the black of unknown depth. Chosen by hand."""
 
-CAPTION_HEIGHT = 28
-CAPTION_MARGIN = 6
-CAPTION_SCALE = 0.5
+CAPTION_HEIGHT, CAPTION_MARGIN, CAPTION_SCALE = 28, 6, 0.5
 """Height and side margin of a caption, in pixels, and its font scale in OpenCV, for images up to
 `READABLE_WIDTH_PX` wide. Chosen by hand so that captions are legible."""
-
 
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
@@ -94,9 +88,9 @@ def draw_matches(
     with_line = np.arange(len(order)) < (LINES if by_position else lines)
     unit = line_scale(canvas)
     for k in np.argsort(good[order], kind="stable"):  # draws good matches last, on top
-        row, color = order[k], tuple(int(v) for v in colors[k])
-        start = tuple(int(v) for v in np.rint(points0[row]))
-        end = tuple(int(v) for v in np.rint(points1[row] + [shown[0].shape[1], 0]))
+        row, color = order[k], colors[k].tolist()
+        start = np.rint(points0[row]).astype(int).tolist()
+        end = np.rint(points1[row] + [shown[0].shape[1], 0]).astype(int).tolist()
         if with_line[k]:
             cv2.line(canvas, start, end, color, round(unit), cv2.LINE_AA)
         for point in (start, end):
@@ -111,9 +105,8 @@ def _colors_of_positions(positions: np.ndarray) -> np.ndarray:
     """
     x, y = np.clip(positions, 0, 1).T
     # OpenCV's hue is in [0, 180), saturation and value are in [0, 255].
-    hsv = np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1)
-    hsv = np.rint(hsv).astype(np.uint8)[None]
-    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if len(x) else np.empty((0, 3), np.uint8)
+    hsv = np.rint(np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1))
+    return cv2.cvtColor(hsv.astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0] if len(x) else hsv
 
 
 def draw_circle(
@@ -173,8 +166,7 @@ def shown_range(values: np.ndarray) -> tuple[float, float]:
 
 def viridis(levels: np.ndarray) -> np.ndarray:
     """Return the (N, 3) RGB colours that `draw_heatmap` gives to (N,) levels in [0, 1]."""
-    colors: np.ndarray = draw_heatmap(np.asarray(levels).reshape(1, -1))[0]
-    return colors
+    return np.asarray(draw_heatmap(np.asarray(levels).reshape(1, -1))[0])
 
 
 def line_scale(picture: np.ndarray) -> float:

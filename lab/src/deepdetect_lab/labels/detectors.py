@@ -15,8 +15,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from deepdetect._shared.errors import MissingExtraError, OptionError, unknown_name
-from deepdetect._shared.opencv import cv2, installed_distributions
+from deepdetect._shared.errors import OptionError, unknown_name
+from deepdetect._shared.opencv import cv2
+
+from .factories import opencv_factory
 
 Value = bool | int | float
 Settings = Mapping[str, Any]
@@ -259,22 +261,3 @@ def select_detectors(names: Iterable[str]) -> tuple[str, ...]:
     if not wanted:
         raise OptionError(f"no label detector was chosen: name some of {', '.join(DETECTOR_NAMES)}")
     return tuple(name for name in DETECTOR_NAMES if name in wanted)
-
-
-def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
-    """Return a factory function of OpenCV, such as "AgastFeatureDetector_create".
-
-    OpenCV 5 has some factories in a contrib module, `cv2.xfeatures2d`. Raises a MissingExtraError
-    if the contrib modules are needed but not installed.
-    """
-    for home in (cv2, getattr(cv2, "xfeatures2d", None)):
-        if hasattr(home, name):
-            factory: Callable[..., cv2.Feature2D] = getattr(home, name)
-            return factory
-    short = name.removesuffix("_create").removesuffix("FeatureDetector").upper()
-    headless = "opencv-python" not in installed_distributions()
-    raise MissingExtraError(
-        f"{short} needs OpenCV's contrib modules, which the installed OpenCV {cv2.__version__} "
-        "lacks: run pip install --force-reinstall --no-deps opencv-contrib-python"
-        + ("-headless" if headless else "")
-    )

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, WeightsError
+from ..._shared.errors import DeepDetectError, WeightsError, first_line
 from ..._shared.options import suggest_keywords
 from ..pretrained import LOGITS
 
@@ -94,5 +94,5 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
 
 def _reason(error: Exception) -> str:
     """Return the line of an engine's error message that gives the reason: OpenVINO's last one."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[-1] if lines[0].startswith("Exception from") else lines[0]
+    reason = first_line(error)
+    return str(error).strip().splitlines()[-1] if reason.startswith("Exception from") else reason

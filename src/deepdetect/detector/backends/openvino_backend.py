@@ -12,13 +12,7 @@ import numpy as np
 from ..._shared.errors import OptionError
 from ..._shared.runtimes import import_openvino
 from ..pretrained import LOGITS, PADDED_IMAGE, POINTS
-from .interface import (
-    RuntimeOptions,
-    as_logits,
-    failed_run,
-    output_to_read,
-    unreadable,
-)
+from .interface import RuntimeOptions, as_logits, failed_run, output_to_read, unreadable
 
 COMPILED_LAYERS = 100
 """OpenVINO compiles layers for each image size, and caches at most this many. Its default, 5000,
@@ -58,15 +52,13 @@ class OpenVinoNetwork:
                 model = self._model = self._compile()
             request = model.create_infer_request()  # one per call, as threads may run at once
             output = request.infer([image], share_inputs=True)[self._output_name]
+            # If memory is short, OpenVINO may also return nothing, or the previous image's map.
+            if self._works and output.shape[2:] != image.shape[2:]:
+                raise MemoryError("OpenVINO gave a map of another size than the image")
         except Exception as error:  # OpenVINO's exceptions share no base class
             self._model = None
             _CORES.clear()
             raise failed_run(error, image.shape) from None
-        # If memory is short, OpenVINO may also return nothing, or the previous image's map.
-        if self._works and output.shape[2:] != image.shape[2:]:
-            self._model = None
-            _CORES.clear()
-            raise MemoryError("OpenVINO gave a map of another size than the image")
         logits = as_logits(output, self._output_name, image.shape, self._path)
         self._works = True
         return logits

@@ -16,14 +16,7 @@ from ..._shared.errors import OptionError, WeightsError, require_packages
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.selection import check_max_keypoints
 from ..pretrained import LOGITS, resolve_weights
-from .graph import (
-    IMAGE,
-    PROBABILITY,
-    fix_size,
-    read_metadata,
-    replace_nodes,
-    write_metadata,
-)
+from .graph import IMAGE, PROBABILITY, fix_size, read_metadata, replace_nodes, write_metadata
 from .points import add_points, remove_points
 
 if TYPE_CHECKING:

@@ -11,11 +11,9 @@ import numpy as np
 from ..._shared.machine import parallel_for
 from .hessian_scales import SIGMAS_PX, VARIANCES, Candidates, ScaleSpace
 
-RING_RADII = (1.0, 2.0, 3.5, 6.0)
-"""Radii of the rings of samples around a candidate, in sigmas of its scale. Chosen by hand."""
-
-RING_POINTS = 8
-"""Number of sampled points on each ring, at equal angles. Chosen by hand."""
+RING_RADII, RING_POINTS = (1.0, 2.0, 3.5, 6.0), 8
+"""Radii of the rings of samples around a candidate, in sigmas of its scale, and number of points on
+each ring, at equal angles. Chosen by hand."""
 
 FEATURES = 23 + 8 * len(RING_RADII)
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
@@ -56,14 +54,9 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
     pixels = np.stack([candidates.level, candidates.row, candidates.column], 1)
     floors = DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR
     features = np.empty((len(candidates), FEATURES), np.float32)
-    parallel_for(
-        len(candidates),
-        measure_candidates,
-        space.smooth.shape,
-        *(maps.reshape(-1) for maps in (space.smooth, space.determinant)),
-        VARIANCES,
-        *(ring_offsets(), pixels, floors, features),
-    )
+    maps = space.smooth.shape, space.smooth.reshape(-1), space.determinant.reshape(-1), VARIANCES
+    given = *maps, ring_offsets(), pixels, floors, features
+    parallel_for(len(candidates), measure_candidates, *given)
     features[:, 17] += 2 * space.gray - 1
     features[:, -2] = np.log((candidates.rank + 1) / space.smooth[0].size) / 2 + 3
     features[:, -1] = (candidates.level - 4) / 3

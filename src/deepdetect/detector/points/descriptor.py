@@ -66,11 +66,8 @@ def describe_learned(
     angles = set_angles(gray, xy, sizes, keypoints.angles)
     below, right = -height % STRIDE, -width % STRIDE
     padded = cv2.copyMakeBorder(gray, 0, below, 0, right, cv2.BORDER_REPLICATE)
-    inputs = {
-        "luma": padded[None, None].astype(np.float32) / 255,
-        "xy": xy[None],
-        "sizes": sizes[None],
-    }
+    luma = padded[None, None].astype(np.float32) / 255
+    inputs = {"luma": luma, "xy": xy[None], "sizes": sizes[None]}
     path = DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor))
     session = _session(path, kind[-DIGEST_LENGTH:], thread_limit())
     upright = session.run(["descriptors"], inputs)[0][0]

@@ -12,11 +12,9 @@ from ..._shared.errors import MissingWeightsError, WeightsError, first_line
 from ..pretrained import RANKER
 from .candidate_features import FEATURES
 
-MAX_DEVIATIONS = 6.0
-"""Features are clipped at this many standard deviations from their mean. Chosen by hand."""
-
-_CHUNK = 2048
-"""This many candidates are ranked at a time: their features stay in the processor's cache."""
+MAX_DEVIATIONS, CHUNK = 6.0, 2048
+"""Features are clipped at this many standard deviations from their mean. This many candidates are
+ranked at a time, so that their features stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +34,8 @@ class Ranker:
     def rank(self, features: np.ndarray) -> np.ndarray:
         """Compute the (N,) float32 logits of (N, F) float32 features; higher is better."""
         logits = np.empty(len(features), np.float32)
-        for start in range(0, len(features), _CHUNK):
-            part = features[start : start + _CHUNK]
+        for start in range(0, len(features), CHUNK):
+            part = features[start : start + CHUNK]
             values = part - self.mean
             values /= self.deviation
             np.clip(values, -MAX_DEVIATIONS, MAX_DEVIATIONS, out=values)
@@ -46,7 +44,7 @@ class Ranker:
                 values += bias
                 if k + 1 < len(self.layers):
                     np.maximum(values, 0, out=values)
-            logits[start : start + _CHUNK] = part[:, 0] + values[:, 0]
+            logits[start : start + CHUNK] = part[:, 0] + values[:, 0]
         return logits
 
 

@@ -26,39 +26,31 @@ from .sgm import (
     semi_global_matching,
 )
 
-MAX_SPECKLE_AREA_PX = 100
-"""Isolated patches of one surface with at most this many pixels are dropped. Chosen by hand."""
-
-SPECKLE_SUBDIVISIONS = 4
-"""Disparities are rounded to this many steps per pixel, because OpenCV's speckle filter needs
-integers. Chosen by hand."""
+MAX_SPECKLE_AREA_PX, SPECKLE_SUBDIVISIONS = 100, 4
+"""Isolated patches of one surface with at most this many pixels are dropped, with disparities in
+this many steps per pixel, because OpenCV's speckle filter needs integers. Chosen by hand."""
 
 BORDER_PX = 4
 """Matches this near to the left or the right border of the right image are dropped, because windows
 give content just outside the image the disparity of content just inside. Chosen by hand."""
 
-OCCLUDING_EDGE_PX = 1
-"""Width in pixels of the edge of nearer surfaces that is dropped if occlusions are filled."""
-
-OCCLUSION_SLACK_PX = 8
-"""A gap between two surfaces may be an occlusion if it is at most this many pixels wider than their
-difference of disparity, because windows reach over both ends of the gap."""
+OCCLUDING_EDGE_PX, OCCLUSION_SLACK_PX = 1, 8
+"""Width in pixels of the edge of nearer surfaces that is dropped if occlusions are filled. A gap
+between two surfaces may be an occlusion if it is at most the second number of pixels wider than
+their difference of disparity, because windows reach over both ends of the gap."""
 
 MIN_SUPPORT_PX = 5
 """Lines that extrapolate a surface are fitted to at least this many pixels. Chosen by hand."""
 
-# If no range is given, it is searched on a copy of this width, without patches up to this area. The
-# range then just covers the Motorcycle pair and the Middlebury scenes of the benchmark.
-SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX = 160, 50
-SEARCH_UNIQUENESS_RATIO = 1.3
-"""Any other match on the row of the small copy must cost at least this many times as much as the
-best match. False matches rarely reach this ratio."""
+SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX, SEARCH_UNIQUENESS_RATIO = 160, 50, 1.3
+"""If no range is given, it is searched on a copy of this width, without patches up to this area.
+Any other match on the row must cost at least the third value times as much as the best, which false
+matches rarely reach. So the range just covers the Motorcycle pair and Middlebury's scenes."""
 
 TAIL_FRACTION = 0.01
 """This fraction of disparities at each end of the range counts as unreliable. Chosen by hand."""
 
-SEARCH_MARGIN_PX = 1.5
-SEARCH_MARGIN_FRACTION = 0.2
+SEARCH_MARGIN_PX, SEARCH_MARGIN_FRACTION = 1.5, 0.2
 """The range is extended at both ends by the first value, in pixels of the small copy, plus the
 second value times its length, because some objects are too small to be seen in the copy."""
 
@@ -99,10 +91,8 @@ class DisparityOptions:
                 "disparity_range must be the smallest and the largest disparity in whole pixels, "
                 f"not {whole}"
             )
-        check_ranges(
-            self,
-            between={"uniqueness_ratio": (1, math.inf), "discontinuity_margin_px": (0, 100)},
-        )
+        ranges = {"uniqueness_ratio": (1, math.inf), "discontinuity_margin_px": (0, 100)}
+        check_ranges(self, between=ranges)
 
 
 DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)
@@ -238,7 +228,9 @@ def compute_disparity(
     trusted = coarse.consistent & clear & is_textured(left)
     known = filter_speckles(coarse.disparity, trusted, MAX_SPECKLE_AREA_PX)
     disparity = refine_disparity(left, right, coarse.disparity, known)
-    known &= _leads_inside(disparity, BORDER_PX)
+    width = left.shape[1]
+    place = np.arange(width, dtype=np.float32) - disparity
+    known &= (place >= BORDER_PX - 0.5) & (place <= width - 0.5 - BORDER_PX)
     matched = known
     if options.discontinuity_margin_px:
         matched = known & ~near_discontinuity(disparity, known, options.discontinuity_margin_px)
@@ -256,13 +248,6 @@ def compute_disparity(
     return DisparityMap(np.where(kept, disparity, np.float32(np.nan)), matched, (low, high))
 
 
-def _leads_inside(disparity: np.ndarray, margin_px: float) -> np.ndarray:
-    """Return which disparities lead into the right image, except for its margin; (H, W) bool."""
-    width = disparity.shape[1]
-    place = np.arange(width, dtype=np.float32) - disparity
-    return (place >= margin_px - 0.5) & (place <= width - 0.5 - margin_px)
-
-
 def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange | None:
     """Find the disparity range of a rectified pair, of both signs and up to half its width.
 
@@ -273,10 +258,8 @@ def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange 
     scale = max(width / SEARCH_WIDTH_PX, 1.0)
     if scale > 1:
         size = (round(width / scale), max(round(height / scale), 1))
-        left, right = (
-            cv2.resize(view, size, interpolation=cv2.INTER_AREA) for view in (left, right)
-        )
-        scale = width / size[0]
+        small = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (left, right))
+        (left, right), scale = small, width / size[0]
     half = left.shape[1] // 2
     coarse = semi_global_matching(left, right, (-half, half))
     clear = coarse.consistent & (coarse.uniqueness_ratio >= SEARCH_UNIQUENESS_RATIO)

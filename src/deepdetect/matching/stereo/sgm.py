@@ -17,8 +17,7 @@ import numpy as np
 from ..._shared.machine import parallel_for
 from ..._shared.opencv import cv2
 
-CENSUS_RADIUS_X = 4
-CENSUS_RADIUS_Y = 3
+CENSUS_RADIUS_X, CENSUS_RADIUS_Y = 4, 3
 """The census window has 9 x 7 pixels: 62 comparisons, which fit into a 64-bit word."""
 
 CENSUS_BITS = (2 * CENSUS_RADIUS_X + 1) * (2 * CENSUS_RADIUS_Y + 1) - 1
@@ -33,28 +32,18 @@ by four to fit into a byte."""
 LANES = 16
 """The number of disparities is rounded up to a multiple of this, for vector registers."""
 
-VOLUME_BYTES = 400_000_000
-"""Cost volumes of more bytes than this are computed in bands of rows, one band after the other."""
+VOLUME_BYTES, BAND_OVERLAP_PX = 400_000_000, 32
+"""Cost volumes of more bytes than this are computed in bands of rows, each with this many further
+rows above and below it, from which paths enter the band. Chosen by hand."""
 
 SAMPLED_ROW_STEP = 48
 """The typical Hamming distance of matches is measured on one row in this many. Chosen by hand."""
 
-BAND_OVERLAP_PX = 32
-"""Each band is computed with this many additional rows above and below it, from which paths enter
-the band. Chosen by hand."""
-
-# The penalties are the best of a few values that were tried on the Motorcycle pair. Noisy images of
-# full size would need larger penalties.
-P1_BITS = 20
-"""Penalty for a disparity that changes by one pixel along a path, in census bits per pixel."""
-
-P2_BITS = 100
-"""Penalty for a larger change where the grey level is constant, in census bits per pixel."""
-
-P2_HALF_GRADIENT_LEVELS = 8
-"""Difference of grey levels between neighbours along a path at which P2 is half of `P2_BITS`."""
-
-MIN_P2_BITS = 1.25 * P1_BITS
+P1_BITS, P2_BITS, MIN_P2_BITS, P2_HALF_GRADIENT_LEVELS = 20, 100, 25, 8
+"""Penalties, in census bits per pixel, for a disparity that changes by one pixel along a path, and
+for a larger change: `P2_BITS` where the grey level is constant, half of it where neighbours differ
+by `P2_HALF_GRADIENT_LEVELS`, and at least `MIN_P2_BITS`. They are the best of a few values that
+were tried on the Motorcycle pair; noisy images of full size would need larger ones."""
 
 OUTSIDE_COST = 0.6
 """Cost of a match outside the right image, if the pair's median match costs 0 and a wrong match 1.
@@ -64,18 +53,12 @@ MAX_DIFFERENCE_PX = 1.0
 """Disparities of neighbours on one surface differ by at most this. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
-"""Radius in pixels of the windows in which the grey values are fitted. It and the next five values
-were chosen on the Motorcycle pair."""
+"""Radius in pixels of the windows in which the grey values are fitted. It and the next values were
+chosen on the Motorcycle pair."""
 
-SMOOTHING_RADIUS_PX = 4
-"""Radius in pixels of the window in which the disparities of one surface are averaged before each
-iteration of the fit, to reduce the bias of the parabola."""
-
-FINAL_SMOOTHING_RADIUS_PX = 2
-"""Radius of the window of the average over disparities after the last iteration of the fit."""
-
-ITERATIONS = 2
-"""Number of iterations of the fit of the grey values."""
+SMOOTHING_RADII_PX, FINAL_SMOOTHING_RADIUS_PX = (4, 4), 2
+"""Radii of the windows in which the disparities of one surface are averaged before each iteration
+of the fit, to reduce the bias of the parabola, and after the last."""
 
 NOISE_LEVELS = 2.0
 """Gradients below this, in grey levels per pixel, are noise: the averaged disparity is kept."""
@@ -223,19 +206,14 @@ def refine_disparity(
     from .kernels import sample_rows, step_rows
 
     gray, target = left.astype(np.float32), right.astype(np.float32)
-    padded = _padded(gray, WINDOW_RADIUS_PX)
     limits = np.array([MAX_DIFFERENCE_PX, NOISE_LEVELS, MIN_GAIN], np.float32)
     refined = disparity
-    for _ in range(ITERATIONS):
-        start = _smoothed(refined, known, SMOOTHING_RADIUS_PX)
+    for radius in SMOOTHING_RADII_PX:
+        start = _smoothed(refined, known, radius)
         values, gradient = np.empty_like(gray), np.empty_like(gray)
         parallel_for(len(gray), sample_rows, target, start, values, gradient)
-        inputs = (
-            padded,
-            _padded(values, WINDOW_RADIUS_PX),
-            _padded(gradient, WINDOW_RADIUS_PX),
-            _padded(start, WINDOW_RADIUS_PX, known),
-        )
+        inputs = [_padded(each, WINDOW_RADIUS_PX) for each in (gray, values, gradient)]
+        inputs.append(_padded(start, WINDOW_RADIUS_PX, known))
         refined = np.empty_like(gray)
         parallel_for(len(gray), step_rows, *inputs, WINDOW_RADIUS_PX, *limits, refined)
     return np.where(known, _smoothed(refined, known, FINAL_SMOOTHING_RADIUS_PX), disparity)

@@ -15,7 +15,7 @@ from deepdetect._shared.opencv import cv2
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.io.image import luma
 
-from ...labels.detectors import opencv_factory
+from ...labels.factories import opencv_factory
 from .method import LocalFeature, OwnScaleDescriptor
 
 MAX_CORNERS = 1_000_000
