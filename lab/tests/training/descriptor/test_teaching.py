@@ -18,6 +18,7 @@ from deepdetect_lab.training.descriptor.teaching import (
     crop_losses,
     measure_teaching,
     pair_losses,
+    up_is_found,
 )
 from deepdetect_lab.training.descriptor.views import Pair
 
@@ -42,6 +43,7 @@ def test_a_perfect_pupil_has_no_loss(
     network: TaughtNetwork, crops: Crops, pairs: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     codes = crops.codes.float() / 2**0.5
+    monkeypatch.setattr(teaching, "turn", lambda code, angles: code)
     monkeypatch.setattr(network, "code", lambda features, xy: codes)
     monkeypatch.setattr(network, "teach", torch.nn.Identity())
     monkeypatch.setattr(network, "scores", lambda *_: torch.logit(crops.survival, 1e-6))
@@ -66,9 +68,19 @@ def test_angles_agree_if_they_turn_as_the_views_do(pairs: Pair, error: float) ->
     )
 
 
+def test_up_is_found_if_angles_are_those_of_the_turned_photographs(
+    network: TaughtNetwork, crops: Crops, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turns = crops.turn[:, None].expand(crops.sizes.shape)
+    directions = torch.stack([turns.cos(), turns.sin()], -1).flatten(0, 1) * 2
+    monkeypatch.setattr(network, "angle", torch.nn.Identity())
+    found = up_is_found(network, directions, crops)
+    torch.testing.assert_close(found, torch.ones_like(found))
+
+
 def test_all_losses_reach_the_weights(network: TaughtNetwork, crops: Crops, pairs: Pair) -> None:
     losses = pair_losses(network, pairs, np.random.default_rng(0)) | crop_losses(network, crops)
-    assert sorted(losses) == ["angles", "codes", "pairs", "relations", "survival"]
+    assert sorted(losses) == ["angles", "codes", "pairs", "relations", "survival", "up"]
     sum(losses.values(), torch.zeros(())).backward()
     without = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()]
     # These layers begin with zeros, or act on zeros.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,15 +11,16 @@ import numpy as np
 import torch
 
 from deepdetect._shared.errors import OptionError
+from deepdetect.geometry.transforms import transform_points
 
-from ..scenes import MARGIN_PX
-from ..synthetic import WHITE
+from ..scenes import MARGIN_PX, ROTATED_SHARES, SCALE, UPRIGHT_DEVIATIONS, View
+from ..synthetic import WHITE, happens, rotation, view_homography
 from ..teachers.readings import Reading, load_reading, reading_file
 from .views import JITTER_PX, SIZE_ERRORS, photograph_view
 
 CROP_PX, CROP_POINTS = 384, 384
-"""Crops are three quarters as wide as the photographs, so that they show as much around a point as
-the teachers saw. Each step draws 384 of about 800 points that were read there, because the loss
+"""Crops are three quarters as wide as the photographs, so that they show about as much around a
+point as the teachers saw. Each step draws 384 of the points that were read there, because the loss
 compares all with all."""
 
 ATTEMPTS = 50
@@ -34,6 +36,7 @@ class Crops(NamedTuple):
         sizes: (B, N) float32 diameters, in pixels.
         codes: (B, N, 192) float16 codes of the teachers.
         survival: (B, N) float32, the share of the points of the photograph that ALIKED finds worse.
+        turn: (B,) float32, the angle by which the photograph is turned, in radians.
     """
 
     images: Any
@@ -41,28 +44,31 @@ class Crops(NamedTuple):
     sizes: Any
     codes: Any
     survival: Any
+    turn: Any
 
 
 def draw_crop(rng: np.random.Generator, reading: Reading) -> Crops | None:
-    """Draw a crop of a photograph; return None if nothing was read there."""
-    side = min(CROP_PX, *reading.luma.shape)
-    side -= side % 128  # the stride of the network
-    height, width = reading.luma.shape
-    origin = np.array([rng.integers(width - side + 1), rng.integers(height - side + 1)])
-    xy = reading.xy - origin
-    rows = np.flatnonzero(((xy > MARGIN_PX) & (xy < side - 1 - MARGIN_PX)).all(1))
+    """Draw a turned and zoomed crop of a photograph; return None if nothing was read there."""
+    scale = math.exp(SCALE.strength(rng))
+    share, deviation = ROTATED_SHARES[0], UPRIGHT_DEVIATIONS[0]
+    angle = rng.uniform(-math.pi, math.pi) if happens(rng, share) else rng.normal(0, deviation)
+    size = np.array(reading.luma.shape[::-1])
+    reach = np.maximum(0, size - scale * CROP_PX) / 2
+    place = (size - 1) / 2 + rng.uniform(-reach, reach)
+    # The view shows the photograph turned by `angle`: its own axes are turned back there.
+    to_photograph = view_homography(CROP_PX, place, scale * rotation(-angle), np.zeros(2))
+    xy = transform_points(reading.xy, np.linalg.inv(to_photograph))
+    rows = np.flatnonzero(((xy > MARGIN_PX) & (xy < CROP_PX - 1 - MARGIN_PX)).all(1))
     if not len(rows):
         return None
     rows = rng.choice(rows, CROP_POINTS, replace=len(rows) < CROP_POINTS)
-    x, y = origin
-    view = reading.luma[y : y + side, x : x + side].astype(np.float32) / WHITE
+    view = View(to_photograph, side_px=CROP_PX).render(reading.luma) / WHITE
     places = xy[rows] + rng.uniform(-JITTER_PX, JITTER_PX, (CROP_POINTS, 2))
-    sizes = reading.sizes[rows] * np.exp(rng.normal(0, SIZE_ERRORS[0], CROP_POINTS))
+    sizes = reading.sizes[rows] / scale * np.exp(rng.normal(0, SIZE_ERRORS[0], CROP_POINTS))
     survival = reading.scores[:, 1].argsort(kind="stable").argsort()[rows] / len(reading.xy)
     places, sizes = places.astype(np.float32), sizes.astype(np.float32)
-    return Crops(
-        photograph_view(rng, view), places, sizes, reading.codes[rows], survival.astype(np.float32)
-    )
+    image, survival = photograph_view(rng, view), survival.astype(np.float32)
+    return Crops(image, places, sizes, reading.codes[rows], survival, np.float32(angle))
 
 
 def draw_crops(

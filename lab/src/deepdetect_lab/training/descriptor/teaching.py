@@ -12,6 +12,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, cosine_similar
 from ..teachers.readings import CODE_LENGTHS
 from .crops import Crops
 from .losses import contrast, maps_of, mirror_half, read_views
+from .network import turn
 from .taught import TaughtNetwork
 from .views import Pair
 
@@ -27,7 +28,8 @@ RIGHT_COSINE = 0.94
 def crop_losses(network: TaughtNetwork, crops: Crops) -> dict[str, Tensor]:
     """Return the losses by which the network learns from the teachers."""
     maps = maps_of(network, crops.images)
-    code = network.code(network.features(maps, crops.positions, crops.sizes), crops.positions)
+    features = network.features(maps, crops.positions, crops.sizes)
+    code = network.code(features, crops.positions)
     cosines = similarity_to_teachers(network, code, crops)
     # Two codes of length 1 side by side have twice the mean of both similarities.
     theirs = crops.codes.float()
@@ -36,15 +38,26 @@ def crop_losses(network: TaughtNetwork, crops: Crops) -> dict[str, Tensor]:
     return {
         "codes": CODE_WEIGHT * (1 - cosines).mean(0).sum(),
         "relations": RELATION_WEIGHT * relations.square().mean(),
+        "up": (1 - up_is_found(network, features, crops)).mean(),
         "survival": binary_cross_entropy_with_logits(scores, crops.survival),
     }
 
 
 def similarity_to_teachers(network: TaughtNetwork, code: Tensor, crops: Crops) -> Tensor:
-    """Return (B * N, 2) cosines of the predicted codes of the teachers with the real ones."""
-    parts = (each.split(CODE_LENGTHS, -1) for each in (network.teach(code), crops.codes.float()))
+    """Return (B * N, 2) cosines of the predicted codes of the teachers with the real ones.
+
+    The teachers have seen the photographs upright, so the descriptors are turned back.
+    """
+    upright = turn(code, -crops.turn[:, None])
+    parts = (each.split(CODE_LENGTHS, -1) for each in (network.teach(upright), crops.codes.float()))
     both = (cosine_similarity(found, known, -1) for found, known in zip(*parts, strict=True))
     return torch.stack(list(both), -1).flatten(0, 1)
+
+
+def up_is_found(network: TaughtNetwork, features: Tensor, crops: Crops) -> Tensor:
+    """Return (B, N) cosines of the errors of angles, if that of an upright photograph is 0."""
+    x, y = normalize(network.angle(features), dim=-1).view(*crops.sizes.shape, 2).unbind(-1)
+    return x * crops.turn.cos()[:, None] + y * crops.turn.sin()[:, None]
 
 
 def pair_losses(
