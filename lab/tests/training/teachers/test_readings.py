@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.command_line import run_command
 
 from deepdetect.io.image import find_images, load_image, luma
 from deepdetect_lab.training.teachers import readings
@@ -59,3 +61,28 @@ def test_an_interrupted_reading_is_resumed(
     for values, expected in zip(stored, known, strict=True):
         np.testing.assert_array_equal(values, expected)
         assert values.dtype == expected.dtype
+
+
+def test_the_commands_read_and_learn(
+    teacher_files: tuple[Path, Path],
+    textures: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    edgepoint, aliked = teacher_files
+    reading = ["dev", "read-teachers", textures, "-o", "readings", "--edgepoint", edgepoint]
+    done = run_command([*map(str, [*reading, "--aliked", aliked, "--json"])])
+    assert done.exit_code == 0, done.output
+    values = json.loads(done.stdout)
+    assert (values["read"], values["skipped"]) == (4, 0)
+    assert values["points"] > 1000
+    monkeypatch.setattr("deepdetect_lab.training.descriptor.taught_task.VAL_CROPS", 1)
+    learning = ["train-descriptor", textures, "--validation", textures, "-o", "taught"]
+    options = ["--crops", "1", "--readings", "readings", "--steps", "1", "--pairs", "1"]
+    counts = ["--val-count", "1", "--val-pairs", "1", "--device", "cpu", "--json"]
+    done = run_command([*map(str, [*learning, *options, *counts])])
+    assert done.exit_code == 0, done.output
+    values = json.loads(done.stdout)
+    assert values["onnx"] is None
+    assert Path(values["weights"]).is_file()
