@@ -31,6 +31,10 @@ DEVELOPMENT = {
     },
     "Weights": {
         "shards": ("deepdetect_lab.cli.train", "Pack images for training on large sets."),
+        "read-teachers": (
+            "deepdetect_lab.cli.train",
+            "Read published descriptors at points of photographs, to learn from them.",
+        ),
         "train-points": ("deepdetect_lab.cli.train", "Train the ranker of keypoints on images."),
         "train-match-filter": (
             "deepdetect_lab.cli.train",

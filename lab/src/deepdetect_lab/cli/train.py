@@ -71,10 +71,10 @@ SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides sq
 SHARDS_RUN = cli.From(write_shards, "shard_size", more="workers")
 PAIRS_RUN = cli.From(
     train_network_on_pairs,
-    "validation init_weights device num_workers",
+    "validation init_weights readings device num_workers",
     more="",
     flags={"init_weights": "--init"},
-    types={"validation": Path, "init_weights": Path | None},
+    types={"validation": Path, "init_weights": Path | None, "readings": Path | None},
     defaults={"init_weights": "random, by the seed", "num_workers": "0 on a CPU"},
 )
 WORKERS_RUN = replace(PAIRS_RUN, common="validation num_workers")
@@ -210,6 +210,32 @@ def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) ->
         output: Folder of the run.
     """
     return _train_on_pairs(images, output, DescriptorTrainingOptions, values)
+
+
+@cli.command()
+def read_teachers(
+    *images: cli.Images, output: cli.Output, edgepoint: Path, aliked: Path
+) -> cli.Result:
+    """Read two published descriptor networks at points of photographs, to train our own on them.
+
+    `train-descriptor --crops 6 --readings FOLDER` learns from the files that this writes, one for
+    each photograph. To resume, run the command again.
+
+        deepdetect dev read-teachers photos/train photos/val -o readings --edgepoint e64.onnx
+            --aliked aliked-n16rot.pth
+
+    Args:
+        output: Folder for the readings.
+        edgepoint: EdgePoint2-E64 as an ONNX file (MIT): image to scores and descriptors.
+        aliked: The authors' file of the weights of ALIKED-n16rot (BSD-3-Clause).
+    """
+    from ..training.teachers.readings import Teachers, write_readings
+
+    folder = cli.output_folder(output)
+    files = list(cli.expand_images(images, folder).values())
+    made = list(write_readings(files, folder, Teachers(edgepoint, aliked), quiet=False))
+    counts = {"read": len(made), "skipped": len(files) - len(made), "points": sum(made)}
+    return cli.Result({"folder": folder, **counts})
 
 
 @cli.command(FILTER_RUN, cli.From(MatchFilterTrainingOptions, "steps drawn val_pairs seed"))

@@ -45,6 +45,7 @@ def to_onnx(
 ) -> onnx.ModelProto:
     """Convert a network to ONNX by tracing it with example `inputs`, which are given by name.
 
+    `output` is the name of the output, or of several with blanks between them.
     `axes` maps each input or output to the names of its axes of variable size, by axis number.
     """
     written = io.BytesIO()
@@ -56,7 +57,7 @@ def to_onnx(
             tuple(inputs.values()),
             written,  # type: ignore[arg-type]  # annotated for the other exporter
             input_names=list(inputs),
-            output_names=[output],
+            output_names=output.split(),
             dynamic_axes=axes,
             opset_version=OPSET,
             dynamo=False,

@@ -274,6 +274,7 @@ class DescriptorTrainingOptions:
         val_count: number of validations.
         val_pairs: number of validation pairs of each kind: upright, rotated, zoomed.
         cross_modal: imitate two different sensors by mixed colour channels, changed tones or edges.
+        crops: crops of photographs in each step whose points teachers have read; 0: no teachers.
         seed: seed of the weights and the pairs.
 
     Raises:
@@ -286,13 +287,14 @@ class DescriptorTrainingOptions:
     val_count: int = 12
     val_pairs: int = 48
     cross_modal: bool = False
+    crops: int = 0
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_ranges(
             self,
             positive=("learning_rate",),
-            not_negative=("seed",),
+            not_negative=("seed", "crops"),
             counts=("steps", "val_count", "val_pairs"),
             between={"pairs": (1, 400)},
         )

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import suggest_keywords
 from deepdetect._shared.progress import progress
 from deepdetect.io.image import find_images
@@ -93,6 +94,7 @@ def train_on_pairs(
     options: PairOptions,
     *,
     init_weights: str | Path | None = None,
+    readings: str | Path | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     num_workers: int | None = None,
     log: Log | None = None,
@@ -111,6 +113,7 @@ def train_on_pairs(
         options: the recipe.
         init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file.
             None: random weights by the seed.
+        readings: folder of the readings of teachers, for a descriptor with `crops` only.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
         num_workers: number of processes that generate pairs; with 0, the training process does it.
             None: 0, or for a descriptor on a GPU, one less than the number of processors. A match
@@ -136,7 +139,13 @@ def train_on_pairs(
     where = DeviceOptions(device=device, num_workers=num_workers)
     files = _files(images, validation, output)
     trainer: Trainer
-    if isinstance(options, DescriptorTrainingOptions):
+    if isinstance(options, DescriptorTrainingOptions) and options.crops:
+        from .descriptor.taught_task import TaughtTrainer
+
+        if readings is None:
+            raise OptionError("`crops` need `readings`, the folder of what teachers read")
+        trainer = TaughtTrainer(*files, options, init_weights, where, Path(readings))
+    elif isinstance(options, DescriptorTrainingOptions):
         from .descriptor.task import DescriptorTrainer
 
         trainer = DescriptorTrainer(*files, options, init_weights, where)

@@ -10,6 +10,7 @@ image (`deepdetect.features.learned`).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import reduce
 from typing import cast
 
@@ -17,13 +18,31 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, relu
 
-from deepdetect.features.learned import CONSTANT, FREQUENCIES
+from deepdetect.features.learned import CONSTANT, FREQUENCIES, LENGTH
 
-HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
-"""`HIDDEN` is the number of hidden units of the perceptron. The others are the numbers of channels
-of feature maps, from 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`)."""
 
-DIMENSIONS = CONSTANT + 2 * len(FREQUENCIES)
+@dataclass(frozen=True)
+class Widths:
+    """The size of a network.
+
+    Attributes:
+        half, quarter, eighth, sixteenth, coarsest: numbers of channels of the feature maps, from
+            1/2 to 1/32 of the size of the octave.
+        hidden: number of hidden units of the perceptron.
+        length: numbers of a descriptor, a multiple of 64.
+        every_map: sample all maps at keypoints, not only the three finest with context.
+    """
+
+    half: int = 16
+    quarter: int = 32
+    eighth: int = 64
+    sixteenth: int = 96
+    coarsest: int = 128
+    hidden: int = 160
+    length: int = LENGTH
+    every_map: bool = True
+
+
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
 """A keypoint up to this size is described by feature maps of the full image only. For a larger
@@ -88,24 +107,27 @@ class Halving(nn.Module):
 class DescriptorNetwork(nn.Module):
     """A network that describes keypoints in luma images whose sides are multiples of 128."""
 
-    def __init__(self) -> None:
+    def __init__(self, widths: Widths = Widths()) -> None:
         super().__init__()
-        self.at_half = Convolution(2, HALF, 4, 2)
-        self.at_quarter = Halving(HALF, QUARTER)
-        self.at_eighth = Halving(QUARTER, EIGHTH)
-        self.at_sixteenth = Halving(EIGHTH, SIXTEENTH)
-        self.at_coarsest = Halving(SIXTEENTH, COARSEST)
-        self.to_sixteenth = nn.Conv2d(COARSEST, SIXTEENTH, 1)
-        self.around_sixteenth = Convolution(SIXTEENTH, SIXTEENTH)
-        self.to_eighth = nn.Conv2d(SIXTEENTH, EIGHTH, 1)
-        self.around_eighth = Convolution(EIGHTH, EIGHTH)
-        features = HALF + QUARTER + 2 * EIGHTH + SIXTEENTH
-        self.input = nn.Linear(2 * features, HIDDEN)
-        self.by_size = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 2 * HIDDEN))
+        sizes = widths.half, widths.quarter, widths.eighth, widths.sixteenth, widths.coarsest
+        half, quarter, eighth, sixteenth, coarsest = sizes
+        self.at_half = Convolution(2, half, 4, 2)
+        self.at_quarter = Halving(half, quarter)
+        self.at_eighth = Halving(quarter, eighth)
+        self.at_sixteenth = Halving(eighth, sixteenth)
+        self.at_coarsest = Halving(sixteenth, coarsest)
+        self.to_sixteenth = nn.Conv2d(coarsest, sixteenth, 1)
+        self.around_sixteenth = Convolution(sixteenth, sixteenth)
+        self.to_eighth = nn.Conv2d(sixteenth, eighth, 1)
+        self.around_eighth = Convolution(eighth, eighth)
+        self.every_map, hidden = widths.every_map, widths.hidden
+        features = half + quarter + eighth + (eighth + sixteenth) * self.every_map
+        self.input = nn.Linear(2 * features, hidden)
+        self.by_size = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 2 * hidden))
         nn.init.zeros_(self.get_parameter("by_size.2.weight"))
         nn.init.zeros_(self.get_parameter("by_size.2.bias"))
-        self.norm, self.middle_norm = nn.BatchNorm1d(HIDDEN), nn.BatchNorm1d(HIDDEN)
-        self.middle, self.output = nn.Linear(HIDDEN, HIDDEN), nn.Linear(HIDDEN, DIMENSIONS)
+        self.norm, self.middle_norm = nn.BatchNorm1d(hidden), nn.BatchNorm1d(hidden)
+        self.middle, self.output = nn.Linear(hidden, hidden), nn.Linear(hidden, widths.length)
         self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # of the loss
 
     def forward(self, luma: Tensor, xy: Tensor, sizes: Tensor) -> Tensor:
@@ -118,7 +140,8 @@ class DescriptorNetwork(nn.Module):
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return five feature maps of each octave, at 1/2, 1/4, 1/8, 1/8 and 1/16 of its size.
 
-        The last two maps also contain context from coarser maps.
+        The last two maps also contain context from coarser maps. Without `every_map`, these are
+        three maps: the first two, and the second one at 1/8.
         """
         x, result = _normalized(luma), []
         for octave in range(OCTAVES):
@@ -128,37 +151,55 @@ class DescriptorNetwork(nn.Module):
             quarter = self.at_quarter(half, octave)
             eighth = self.at_eighth(quarter, octave)
             sixteenth = self.at_sixteenth(eighth, octave)
-            coarse = _doubled(self.to_sixteenth(self.at_coarsest(sixteenth, octave)))
+            coarse = double(self.to_sixteenth(self.at_coarsest(sixteenth, octave)))
             sixteenth = self.around_sixteenth(sixteenth + coarse, octave)
-            coarse = _doubled(self.to_eighth(sixteenth))
+            coarse = double(self.to_eighth(sixteenth))
             around = self.around_eighth(eighth + coarse, octave)
-            result.append([half, quarter, eighth, around, sixteenth])
+            every = [half, quarter, eighth, around, sixteenth]
+            result.append(every if self.every_map else [half, quarter, around])
         return result
 
     def describe(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
         """Return (B, N, 64) descriptors at keypoints, from the feature maps of all octaves."""
+        return self.code(self.features(maps, xy, sizes), xy)
+
+    def code(self, features: Tensor, xy: Tensor) -> Tensor:
+        """Return (B, N, 64) descriptors from hidden units (B * N, H) at keypoints (B, N, 2)."""
+        return normalize(self.output(features), dim=1).unflatten(0, xy.shape[:2])
+
+    def features(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
+        """Return (B * N, H) hidden units at keypoints, of which the descriptors are made."""
+        strides = (2, 4, 8, 8, 16) if self.every_map else (2, 4, 8)
         octaves = [
             torch.cat(
                 [
-                    _read(features, (xy + 0.5) / (stride << octave) - 0.5)
-                    for features, stride in zip(maps[octave], (2, 4, 8, 8, 16), strict=True)
+                    read_map(features, (xy + 0.5) / (stride << octave) - 0.5)
+                    for features, stride in zip(maps[octave], strides, strict=True)
                 ],
                 2,
             )
             for octave in range(OCTAVES)
         ]
-        sizes = sizes.clamp(min=SMALLEST_SIZE_PX)
-        own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, OCTAVES - 1)[..., None]
-        shares = (1 - (own - torch.arange(OCTAVES, device=xy.device)).abs()).clamp(min=0)
-        parts = map(torch.mul, octaves, shares.split(1, -1))
-        own_octave = reduce(torch.add, parts)
+        own_octave = reduce(torch.add, map(torch.mul, octaves, shares_of_octaves(sizes)))
         features = self.input(torch.cat([octaves[0], own_octave], 2)).flatten(0, 1)
-        scale = (sizes / SMALLEST_SIZE_PX).flatten().log()[:, None]
-        seen = torch.cat([scale - 0.7, (scale - 0.7) ** 2 - 0.3, (scale * 3).sin()], 1)
+        seen = size_features(sizes).flatten(0, 1)
         gain, shift = self.by_size(seen).chunk(2, 1)
         features = relu(self.norm(features) * (1 + gain) + shift)
-        features = relu(self.middle_norm(self.middle(features)))
-        return normalize(self.output(features), dim=1).unflatten(0, xy.shape[:2])
+        return relu(self.middle_norm(self.middle(features)))
+
+
+def shares_of_octaves(sizes: Tensor) -> tuple[Tensor, ...]:
+    """Return the share of each octave, (B, N, 1), in what is read at keypoints of sizes (B, N)."""
+    sizes = sizes.clamp(min=SMALLEST_SIZE_PX)
+    own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, OCTAVES - 1)[..., None]
+    shares = (1 - (own - torch.arange(OCTAVES, device=sizes.device)).abs()).clamp(min=0)
+    return shares.split(1, -1)
+
+
+def size_features(sizes: Tensor) -> Tensor:
+    """Return functions (B, N, 3) of sizes (B, N), from which perceptrons learn."""
+    scale = (sizes.clamp(min=SMALLEST_SIZE_PX) / SMALLEST_SIZE_PX).log()[..., None]
+    return torch.cat([scale - 0.7, (scale - 0.7) ** 2 - 0.3, (scale * 3).sin()], -1)
 
 
 def _normalized(luma: Tensor) -> Tensor:
@@ -176,11 +217,12 @@ def _normalized(luma: Tensor) -> Tensor:
     return torch.cat([whole, luma * field[:, 1:] - field[:, :1]], 1)
 
 
-def _doubled(features: Tensor) -> Tensor:
+def double(features: Tensor) -> Tensor:
+    """Return maps (B, C, H, W) of twice the height and width, interpolated bilinearly."""
     return interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
 
 
-def _read(features: Tensor, xy: Tensor) -> Tensor:
+def read_map(features: Tensor, xy: Tensor) -> Tensor:
     """Sample feature maps (B, C, H, W) bilinearly at positions (B, N, 2); return (B, N, C).
 
     Positions are clamped to the map. On a CPU this is twenty times as fast as `grid_sample`.
@@ -203,8 +245,12 @@ def _read(features: Tensor, xy: Tensor) -> Tensor:
 
 
 def turn(descriptors: Tensor, angles: Tensor) -> Tensor:
-    """Rotate descriptors (..., 64) by angles (...) in radians, as `turn_descriptors` does."""
-    turns = angles[..., None] * torch.from_numpy(FREQUENCIES).to(angles)
-    constant, numbers = descriptors[..., :CONSTANT], descriptors[..., CONSTANT:]
+    """Rotate descriptors (..., 64) by angles (...) in radians, as `turn_descriptors` does.
+
+    Longer ones, of a multiple of 64 numbers, have as many times more numbers of each frequency.
+    """
+    times = descriptors.shape[-1] // LENGTH
+    turns = angles[..., None] * torch.from_numpy(FREQUENCIES.repeat(times)).to(angles)
+    constant, numbers = descriptors.tensor_split([times * CONSTANT], -1)
     (real, imaginary), (c, s) = numbers.chunk(2, -1), (turns.cos(), turns.sin())
     return torch.cat([constant, c * real - s * imaginary, s * real + c * imaginary], -1)

@@ -108,6 +108,8 @@ class DescriptorTrainer(Trainer):
         "shares"
     )
     weights_file = "descriptor.safetensors"
+    kind_of_network = DescriptorNetwork
+    no_kernels: tuple[str, ...] = ("at_half", "by_size")
     max_gradient_norm = 2.0
     average_decay = 0.998
     network: DescriptorNetwork
@@ -127,9 +129,9 @@ class DescriptorTrainer(Trainer):
         self.device = torch.device(device.accelerator)
         self.files = images
         network: Any = (
-            seeded(DescriptorNetwork, options.seed)
+            seeded(self.kind_of_network, options.seed)
             if init_weights is None
-            else load_network(init_weights, DescriptorNetwork)
+            else load_network(init_weights, self.kind_of_network)
         )
         self.origin = digests(images, validation)
         self.origin["initial_weights"] = weights_digest(network)[:16]
@@ -140,11 +142,11 @@ class DescriptorTrainer(Trainer):
         self.average = copy.deepcopy(self.network).eval()
         self.network.train()
         # Muon suits layers between many features. AdamW trains the other parameters: the first
-        # layer, the layers that take the keypoint's size, and vectors.
+        # layer, the layers that take the keypoint's size or give few numbers, and vectors.
         kernels: list[Any] = []
         vectors: list[Any] = []
         for name, parameter in self.network.named_parameters():
-            kernel = parameter.ndim > 1 and not name.startswith(("at_half", "by_size"))
+            kernel = parameter.ndim > 1 and not name.startswith(self.no_kernels)
             (kernels if kernel else vectors).append(parameter)
         group = {"params": vectors, "rate_factor": VECTOR_RATE}
         adam = torch.optim.AdamW([group], betas=(0.9, 0.98), weight_decay=0, fused=True)
@@ -182,8 +184,11 @@ class DescriptorTrainer(Trainer):
                 kept[slots] = values
         rows = torch.from_numpy(pairs_of_step(self.options, step) % WINDOW).to(self.device)
         chosen = Pair(*(kept[rows] for kept in self.window or ()))
-        generator = np.random.default_rng([self.options.seed, 5, step])
-        return contrastive_loss(self.network, chosen, generator, angles_counted(self.kind))
+        return self.loss_of_pairs(chosen, np.random.default_rng([self.options.seed, 5, step]))
+
+    def loss_of_pairs(self, pairs: Pair, generator: np.random.Generator) -> Tensor:
+        """Return the loss of the pairs of a step."""
+        return contrastive_loss(self.network, pairs, generator, angles_counted(self.kind))
 
     def learning_rate(self, step: int) -> float:
         """Return Muon's learning rate in a step: a warm-up, a plateau, a linear decay to 0."""
@@ -195,7 +200,7 @@ class DescriptorTrainer(Trainer):
         shares = shares_right(self.average, self.batches, angles_counted(self.kind))
         return {"score": sum(shares.values()) / len(shares), **shares}
 
-    def export(self, folder: Path) -> Path:
+    def export(self, folder: Path) -> Path | None:
         best: Any = load_network(folder / self.weights_file, DescriptorNetwork)
         export_descriptor(best, folder / ONNX, self.kind)
         return folder / ONNX

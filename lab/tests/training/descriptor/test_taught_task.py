@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from deepdetect import OptionError
+from deepdetect_lab.networks.export import to_onnx
+from deepdetect_lab.networks.weights import load_network
+from deepdetect_lab.training import DescriptorTrainingOptions, train_on_pairs
+from deepdetect_lab.training.descriptor.losses import KINDS
+from deepdetect_lab.training.descriptor.taught import TaughtNetwork
+from deepdetect_lab.training.descriptor.taught_task import TaughtTrainer
+from deepdetect_lab.training.trainer import CHECKPOINT, TrainingResult
+
+OPTIONS = DescriptorTrainingOptions(steps=3, pairs=2, crops=1, val_count=1, val_pairs=1)
+
+
+def run(textures: Path, readings: Path, folder: Path) -> TrainingResult:
+    how: Any = {"readings": readings, "device": "cpu"}
+    return train_on_pairs(textures, textures, folder, OPTIONS, **how)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fast() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("deepdetect_lab.training.trainer.CHECKPOINT_INTERVAL_S", 0)
+        patch.setattr("deepdetect_lab.training.descriptor.taught_task.VAL_CROPS", 1)
+        yield
+
+
+def test_an_interrupted_run_ends_with_the_same_weights(
+    textures: Path, made_readings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run(textures, made_readings, tmp_path / "whole")
+    counted = [f"{kind} correct" for kind in KINDS] + ["edgepoint score", "aliked score"]
+    assert whole.best["score"] == pytest.approx(np.mean([whole.best[name] for name in counted]))
+    assert "MIT" in (tmp_path / "whole/MODEL_CARD.md").read_text("utf-8")
+    calls, step = iter(range(2)), TaughtTrainer.training_step
+
+    def training_step(*arguments: Any) -> float:
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return step(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TaughtTrainer, "training_step", training_step)
+        with pytest.raises(KeyboardInterrupt):
+            run(textures, made_readings, tmp_path / "parts")
+    assert run(textures, made_readings, tmp_path / "parts").points == whole.points
+    first, second = (load_file(tmp_path / name / CHECKPOINT) for name in ("whole", "parts"))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    again: Any = load_network(whole.weights, TaughtNetwork)
+    assert isinstance(again, TaughtNetwork)
+
+
+def test_crops_need_readings(textures: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="need `readings`"):
+        train_on_pairs(textures, textures, tmp_path, OPTIONS)
+
+
+def test_an_onnx_file_gives_the_same_numbers() -> None:
+    torch.manual_seed(0)
+    network = TaughtNetwork().eval()
+    example = {"luma": torch.zeros(1, 1, 128, 256), "xy": torch.ones(1, 5, 2)}
+    example["sizes"] = torch.ones(1, 5)
+    axes = {name: {1: "keypoints"} for name in ("xy", "sizes", "codes", "scores", "directions")}
+    model = to_onnx(network, example, "codes scores directions", {"luma": {2: "h", 3: "w"}, **axes})
+    written = io.BytesIO(model.SerializeToString()).getvalue()
+    session = onnxruntime.InferenceSession(written, providers=["CPUExecutionProvider"])
+    luma, xy, sizes = torch.rand(1, 1, 256, 256), torch.rand(1, 40, 2) * 255, torch.rand(1, 40) * 30
+    with torch.no_grad():
+        expected = network(luma, xy, sizes)
+    inputs = {"luma": luma.numpy(), "xy": xy.numpy(), "sizes": sizes.numpy()}
+    for found, known in zip(session.run(None, inputs), expected, strict=True):
+        np.testing.assert_allclose(found, known.numpy(), atol=1e-4)
+    assert expected[0].shape == (1, 40, 128)

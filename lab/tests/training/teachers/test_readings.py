@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.command_line import run_command
+
+from deepdetect.io.image import find_images, load_image, luma
+from deepdetect_lab.training.teachers import readings
+from deepdetect_lab.training.teachers.readings import (
+    POINTS,
+    STRONG_DENSITY,
+    Teachers,
+    choose_points,
+    load_reading,
+    read_photograph,
+    reading_file,
+    write_readings,
+)
+
+
+def test_points_are_strong_and_weak_ones(textures: Path) -> None:
+    gray = luma(load_image(textures / "0.png"))
+    xy, sizes, places = choose_points(gray, np.random.default_rng(0))
+    best = round(STRONG_DENSITY * gray.size)
+    assert len(xy) == len(sizes) == len(places) <= POINTS
+    assert np.unique(places).size == len(places)
+    assert (places < best).sum() == POINTS // 2
+    assert ((xy > 0) & (xy < 479)).all()
+
+
+@pytest.mark.parametrize("shape", [(64, 96), (70, 90)])
+def test_both_teachers_are_read_at_the_points(teachers: Teachers, shape: tuple[int, int]) -> None:
+    rgb = np.zeros((*shape, 3), np.uint8)
+    rgb[:] = np.linspace(0, 250, shape[1])[None, :, None]
+    xy = np.array([[20.0, 30], [60, 30], [70.3, 50.6]])
+    codes, scores = teachers.read(rgb, xy)
+    np.testing.assert_allclose(np.linalg.norm(codes[:, :64], axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(codes[:, 64:], axis=1), 1, atol=1e-5)
+    # The scores are three times the image, the highest within 2 px: the ramp rises to the right.
+    expected = 3 * (xy[:, 0] + 2) / (shape[1] - 1) * 250 / 255
+    np.testing.assert_allclose(scores[:, 0], expected, atol=0.04)
+    assert codes.shape == (3, 192)
+    assert codes[2, 0] > codes[1, 0] > codes[0, 0] > 0
+
+
+def test_an_interrupted_reading_is_resumed(
+    teachers: Teachers, textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(readings, "POINTS", 60)
+    images = find_images(textures)
+    first = next(write_readings(images, tmp_path, teachers))
+    assert [path.name for path in tmp_path.iterdir()] == [reading_file(images[0], tmp_path).name]
+    assert len(list(write_readings(images, tmp_path, teachers))) == len(images) - 1
+    assert list(write_readings(images, tmp_path, teachers)) == []
+    stored = load_reading(reading_file(images[0], tmp_path))
+    known = read_photograph(teachers, images[0])
+    assert first == len(stored.xy) == 60
+    for values, expected in zip(stored, known, strict=True):
+        np.testing.assert_array_equal(values, expected)
+        assert values.dtype == expected.dtype
+
+
+def test_the_commands_read_and_learn(
+    teacher_files: tuple[Path, Path],
+    textures: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    edgepoint, aliked = teacher_files
+    reading = ["dev", "read-teachers", textures, "-o", "readings", "--edgepoint", edgepoint]
+    done = run_command([*map(str, [*reading, "--aliked", aliked, "--json"])])
+    assert done.exit_code == 0, done.output
+    values = json.loads(done.stdout)
+    assert (values["read"], values["skipped"]) == (4, 0)
+    assert values["points"] > 1000
+    monkeypatch.setattr("deepdetect_lab.training.descriptor.taught_task.VAL_CROPS", 1)
+    learning = ["train-descriptor", textures, "--validation", textures, "-o", "taught"]
+    options = ["--crops", "1", "--readings", "readings", "--steps", "1", "--pairs", "1"]
+    counts = ["--val-count", "1", "--val-pairs", "1", "--device", "cpu", "--json"]
+    done = run_command([*map(str, [*learning, *options, *counts])])
+    assert done.exit_code == 0, done.output
+    values = json.loads(done.stdout)
+    assert values["onnx"] is None
+    assert Path(values["weights"]).is_file()
