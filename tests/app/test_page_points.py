@@ -200,7 +200,7 @@ def test_large_photographs_are_reduced_to_the_size_that_points_take(
 
     def none(gray: np.ndarray, *_: Any, **__: Any) -> Keypoints:
         seen.append(gray.shape[::-1])
-        return Keypoints(np.empty((0, 2)), [], gray.shape[::-1])
+        return Keypoints(np.empty((0, 2)), [], gray.shape[::-1], sizes=[])
 
     monkeypatch.setattr(point_detector, "detect_points", none)
     rgb = np.zeros((size[1], size[0], 3), np.uint8)

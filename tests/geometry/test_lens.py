@@ -68,6 +68,19 @@ def test_chance_and_few_matches_show_no_lens(seed: int) -> None:
     assert distortion(*(part[:20] for part in matches("equidistant")[:3]), (SIZE, SIZE)) == 0
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_two_motions_are_no_lens(seed: int) -> None:
+    """The middle of the image turns by itself, and the rest is shifted."""
+    rng, side = np.random.default_rng(seed), 256
+    first = rng.uniform(0, side, (500, 2))
+    middle = np.linalg.norm(first - side / 2, axis=1) < 100
+    turn = cv2.getRotationMatrix2D((side / 2, side / 2), 20, 1)
+    turned = first @ turn[:, :2].T + turn[:, 2]
+    second = np.where(middle[:, None], turned, first + (7, 4)) + rng.normal(0, 0.3, (500, 2))
+    for agreeing in (middle, ~middle):
+        assert distortion(first, second, agreeing, ((side, side), (side, side))) == 0
+
+
 def test_deviations_of_a_constant_fall_in_noise() -> None:
     falls = np.tile([0.0, 2.0], 50)  # mean 1, standard deviation 1
     assert deviations(falls + 3, np.full(100, 3.0)) == pytest.approx(10)

@@ -82,7 +82,12 @@ def _compared(
         for scales in (SCALES[1:], SCALES[4:]):
             again = _costs(xy, 0.0, np.exp(-costs), scales, flat)
             straight = min(straight, again, key=np.sum)
-    clear = deviations(straight, bent[best]) >= least
+    # Something that moves by itself gets a fit of its own, so that it does not pass for a lens.
+    several = [
+        np.minimum(costs, _costs(xy, each, 1 - np.exp(-costs), SCALES, flat))
+        for costs, each in ((straight, 0.0), (bent[best], DISTORTIONS[best]))
+    ]
+    clear = deviations(straight, bent[best]) >= least and deviations(*several) >= least
     return DISTORTIONS[best] if clear else 0.0, straight, bent[best]
 
 

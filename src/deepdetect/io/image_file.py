@@ -102,7 +102,9 @@ OTHERS = {
         "an archive: unpack it, and give the folder"
     ),
     rb"%PDF": 'a PDF file: draw its pages, as pdftoppm -r 200 -png "{0}" page does, and give these',
-    rb"(?!#EXTM3U)[^\0-\x08\x0e-\x1a\x1c-\x1f]{4,}\Z": "text: give image files, or their folder",
+    rb"(?!#EXTM3U)[^\0-\x08\x0e-\x1a\x1c-\x1f]{4,}\Z": (
+        "text, no image or video: give such files, or their folder"
+    ),
 }
 """First bytes of files that people give for images or videos, what these are, and what to do. A
 playlist of a video is text that OpenCV reads."""
