@@ -39,6 +39,7 @@ from ..geometry.transforms import (
 from ..io.image import Images, load_pixels, one_range
 from ..io.image_file import file_name, is_file
 from ..io.picture_file import read_metadata
+from .guided.evidence import similar_shifts
 from .overlay import scene_of
 from .pipeline import match_images
 
@@ -244,8 +245,13 @@ def _union(
     return (*low.astype(int).tolist(), *high.astype(int).tolist())
 
 
-def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
+def agree(
+    gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray, recurring: bool = False
+) -> bool:
     """Return whether two images, (H, W) uint8 luma, are alike once a homography aligns them.
+
+    With `recurring`, they must also be more alike than shifted by a line of text or a window of a
+    facade. In screenshots, what stands still may align lines that have nothing in common.
 
     A window that is flat in one image only is either a difference, as on boards and forms, or
     unknown, as in clipped shadows. Either view may show that the images agree.
@@ -254,23 +260,28 @@ def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
     matrix = scaled_homography(homography, scale0, scale1)
     # Images of two sensors, or a negative and its print, are alike in their edges only.
     edges = edge_strength(first), edge_strength(second)
-    return _alike(first, second, matrix) or _alike(*edges, matrix)
+    return _alike(first, second, matrix, recurring) or _alike(*edges, matrix, recurring)
 
 
-def _alike(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> bool:
+def _alike(first: np.ndarray, second: np.ndarray, homography: np.ndarray, recurring: bool) -> bool:
     """Return whether enough windows correlate better than in shifted copies."""
     own = _correlations(first, second, homography)
-    moves = (
-        translation_matrix(x * radius * min(first.shape), y * radius * min(first.shape))
-        for radius in SHIFTS
-        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
-    )
-    shifted = [_correlations(first, second, homography @ move) for move in moves]
-    for aligned, *others in zip(own, *shifted, strict=True):
-        chance = np.concatenate(others)
-        enough = len(aligned) > 0 and len(chance) > 0
-        if enough and np.median(aligned) > np.quantile(chance, 1 - MAX_SHIFTED_FRACTION):
-            return True
+    side, steps = min(first.shape), ((1, 0), (-1, 0), (0, 1), (0, -1))
+    far = [(x * radius * side, y * radius * side) for radius in SHIFTS for x, y in steps]
+    similar, bounds = [], []
+    if recurring:
+        warped = warp_to_reference(second, homography, first.shape[::-1])
+        similar = similar_shifts(first, *warped).tolist()
+    for shifts in (far, similar):
+        moves = [homography @ translation_matrix(*shift) for shift in shifts]
+        copies = zip(*(_correlations(first, second, move) for move in moves), strict=True)
+        bounds.append([np.concatenate(of_kind) for of_kind in copies])
+    for kind, aligned in enumerate(own):
+        chances = [each[kind] for each in bounds if each and len(each[kind])]
+        if len(aligned) and chances:
+            limits = [np.quantile(chance, 1 - MAX_SHIFTED_FRACTION) for chance in chances]
+            if np.median(aligned) > max(limits):
+                return True
     return False
 
 

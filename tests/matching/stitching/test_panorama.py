@@ -10,7 +10,7 @@ import pytest
 import skimage.data
 from PIL import Image
 
-from deepdetect import (
+from deepdetect import (, RegistrationError
     DeepDetect,
     DeepDetectError,
     ImageError,
@@ -344,3 +344,29 @@ def test_screens_with_a_small_header_make_a_page() -> None:
     assert found.image.shape[:2] == (460, 300)
     shifts = [found.homographies[number][1, 2] for number in range(3)]
     np.testing.assert_allclose(shifts, [0, 80, 160], atol=0.5)
+
+
+@pytest.mark.parametrize(("scroll", "height"), [(500, None), (300, 1200)])
+def test_screens_with_header_and_menu_are_no_pile(scroll: int, height: int | None) -> None:
+    """Two screens of a text page are one taller page, or refused; they do not lie on each other."""
+    rng, font = np.random.default_rng(3), cv2.FONT_HERSHEY_SIMPLEX
+    page = np.full((1500, 700), 255, np.uint8)
+    for y in range(30, 1490, 26):
+        line = "".join(rng.choice(list("abcdefghijklmnopqrstuvwxyz    "), 52))
+        cv2.putText(page, line, (20, y), font, 0.55, 30, 1, cv2.LINE_AA)
+    screens = []
+    for top in (0, scroll):
+        screen = np.full((900, 900), 220, np.uint8)
+        screen[:, 200:] = page[top : top + 900]
+        for k in range(20):
+            entry = f"menu entry {k * 7919 % 97}"
+            cv2.putText(screen, entry, (10, 170 + 34 * k), font, 0.5, 40, 1, cv2.LINE_AA)
+        screen[:120] = 60
+        title = "NEWS  Home  World  Sports  Login"
+        cv2.putText(screen, title, (30, 70), font, 1.1, 255, 2, cv2.LINE_AA)
+        screens.append(screen)
+    if height is None:
+        with pytest.raises(RegistrationError):
+            stitch(screens)
+    else:
+        assert stitch(screens).image.shape[:2] == (height, 900)

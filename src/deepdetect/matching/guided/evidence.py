@@ -123,7 +123,7 @@ def is_repeated(
     x, y = np.rint(scaled_points(points0, scale0)).clip(0, last).astype(np.int64).T
     places = np.zeros(first.shape, bool)
     places[y, x] = True
-    for shift in _similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
+    for shift in similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
         other = refine_homography(first, second, matrix @ translation_matrix(*shift))
         middle = np.array([last / 2])
         if transfer_errors(middle, middle, np.linalg.inv(matrix) @ other)[0] < MIN_SHIFT_PX:
@@ -196,7 +196,7 @@ def _parallax_decides(
     return own < min(other, 0) + MAX_LOG10_NFA
 
 
-def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return the shifts (dx, dy), best first, at which two aligned images also correlate well."""
     size = [cv2.getOptimalDFTSize(2 * side) for side in first.shape]
 

@@ -54,6 +54,10 @@ MAX_DISAGREEMENT_PX = 2.0
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
+MAX_STILL_FRACTION = 0.05
+"""Images stand still if their matches move by less than this fraction of their extent: a homography
+of what stands still in screenshots bends by some pixels to the lines around it."""
+
 MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
 """Images contradict each other if the RMS residual of their joint fit exceeds the inlier threshold
 of a homography: a typical match is then an outlier. It is 0.2 to 1 px if nothing is wrong."""
@@ -144,7 +148,9 @@ def register_images(
     worst = max(pairs, key=lambda pair: _disagreement_px(pair, to_common))
     off_px = _disagreement_px(worst, to_common)
     grays = [view.gray for view in views]
-    unlike = [not agree(grays[p.first], grays[p.second], p.homography) for p in pairs]
+    unlike = [
+        not agree(grays[p.first], grays[p.second], p.homography, _stands_still(p)) for p in pairs
+    ]
     if residual_px > MAX_RESIDUAL_PX or np.mean(unlike) > 0.5:  # a few wrong pairs are outvoted
         reason = (
             f"{names[worst.first]} and {names[worst.second]} contradict each other where they "
@@ -177,6 +183,13 @@ def _disagreement_px(pair: RegisteredPair, to_common: dict[int, np.ndarray]) -> 
     matrix = np.linalg.inv(to_common[pair.second]) @ to_common[pair.first]
     expected = transform_points(pair.points, pair.homography)
     return float(np.sqrt(np.mean(transfer_errors(pair.points, expected, matrix) ** 2)))
+
+
+def _stands_still(pair: RegisteredPair) -> bool:
+    """Return whether a pair's homography hardly moves its matches."""
+    moved = transform_points(pair.points, pair.homography)
+    extent = np.ptp(pair.points, axis=0).max()
+    return bool(np.abs(moved - pair.points).max() < MAX_STILL_FRACTION * extent)
 
 
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
