@@ -10,12 +10,13 @@ import pytest
 import skimage.data
 from PIL import Image
 
-from deepdetect import (, RegistrationError
+from deepdetect import (
     DeepDetect,
     DeepDetectError,
     ImageError,
     OptionError,
     PointDetector,
+    RegistrationError,
 )
 from deepdetect.geometry import transform_points
 from deepdetect.matching.stitching import Panorama, StitchingOptions, stages_of, stitch
