@@ -26,7 +26,7 @@ from deepdetect_lab.evaluation.baselines.method import (
     with_common_descriptor,
     with_own_scale,
 )
-from deepdetect_lab.evaluation.baselines.opencv import CLASSICAL
+from deepdetect_lab.evaluation.baselines.opencv import CLASSICAL, STANDARD
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_own_sizes_and_angles_are_those_of_the_keypoints_or_the_gradients(crop: 
 
 
 def test_points_at_their_own_scale_are_those_of_the_common_row(crop: np.ndarray) -> None:
-    common, own = (make(CLASSICAL["sift"]) for make in (with_common_descriptor, with_own_scale))
+    common, own = (make(STANDARD["sift"]) for make in (with_common_descriptor, with_own_scale))
     with pytest.raises(OptionError):
         with_own_scale(CLASSICAL["fast"])
     assert common.detection == own.detection

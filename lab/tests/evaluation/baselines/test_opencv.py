@@ -10,7 +10,7 @@ import pytest
 
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.io.image import luma
-from deepdetect_lab.evaluation.baselines.opencv import CLASSICAL, describe_with
+from deepdetect_lab.evaluation.baselines.opencv import CLASSICAL, STANDARD, describe_with
 
 HOME = cv2 if hasattr(cv2, "BRISK_create") else cv2.xfeatures2d
 
@@ -39,7 +39,7 @@ def low_fast() -> cv2.FastFeatureDetector:
 
 # SIFT: number, layers, contrast, edge, sigma.  BRISK: threshold, octaves.
 DETECTORS: dict[str, Callable[[], cv2.Feature2D]] = {
-    "sift": lambda: cv2.SIFT_create(enable_precise_upscale=True),
+    "sift": cv2.SIFT_create,
     "sift-low": lambda: cv2.SIFT_create(0, 4, 1e-9, 100, 0.7),
     "orb": cv2.ORB_create,
     "orb-low": low_orb,
@@ -91,7 +91,7 @@ def test_sift_finds_spots_where_they_are() -> None:
     )
     light = sum(np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * 2.5**2)) for cx, cy in centres)
     rgb = np.repeat(np.rint(30 + 180 * light).astype(np.uint8)[..., None], 3, axis=2)
-    found = CLASSICAL["sift"].detect(rgb).xy
+    found = STANDARD["sift"].detect(rgb).xy
     offsets = found[:, None] - centres
     nearest = offsets[np.linalg.norm(offsets, axis=2).argmin(axis=0), np.arange(16)]
     assert np.abs(nearest).max() < 0.2

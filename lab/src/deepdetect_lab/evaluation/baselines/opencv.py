@@ -27,8 +27,9 @@ AGAST_7_12D = 1
 
 OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
     # SIFT: Lowe 2004. ORB: Rublee et al. 2011. BRISK: Leutenegger et al. 2011.
-    # Without precise upscaling, OpenCV shifts positions by a quarter of a pixel.
-    "sift": ("SIFT", "SIFT_create", {"enable_precise_upscale": True}),
+    "sift": ("SIFT", "SIFT_create", {}),
+    # By default OpenCV shifts positions by a quarter of a pixel, as in the paper's tables.
+    "sift-precise": ("SIFT", "SIFT_create", {"enable_precise_upscale": True}),
     "sift-low": (
         "SIFT, low settings",
         "SIFT_create",
@@ -97,8 +98,8 @@ def _opencv(name: str) -> LocalFeature:
         return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
 
     title, factory, settings = OPENCV_SETTINGS[name]
-    if name == "sift":  # upscales the image for both in the same way
-        feature = _feature(name, title, detect, factory, settings)
+    if name == "sift-precise":  # upscales the image for both in the same way
+        feature = _feature("sift", title, detect, factory, settings)
         return replace(feature, version="2", detection="", own_scale=OwnScaleDescriptor())
     binary = factory in ("ORB_create", "BRISK_create")
     return _feature(name, title, detect, factory if binary else "SIFT_create")
@@ -172,7 +173,7 @@ def _corners(rgb: np.ndarray, corners: np.ndarray | None, scores: np.ndarray) ->
 
 
 CLASSICAL: dict[str, LocalFeature] = {
-    **{name: _opencv(name) for name in OPENCV_SETTINGS if name != "orb-many"},
+    **{name: _opencv(name) for name in OPENCV_SETTINGS if name not in ("orb-many", "sift-precise")},
     "harris": _harris("harris", "Harris", 2, 3, 0.04, 0.04),
     "harris-low": _harris("harris-low", "Harris, low settings", 3, 5, 0.001, 0.001),
     "shi-tomasi": _shi_tomasi("shi-tomasi", "Shi-Tomasi", 0.01, 0.04),
@@ -181,7 +182,7 @@ CLASSICAL: dict[str, LocalFeature] = {
 """The classical detectors of the paper's tables, with default and with low settings, by name."""
 
 STANDARD: dict[str, LocalFeature] = {
-    "sift": CLASSICAL["sift"],
+    "sift": _opencv("sift-precise"),
     "orb": _opencv("orb-many"),
     "brisk": CLASSICAL["brisk"],
     "fast": CLASSICAL["fast"],
@@ -191,8 +192,9 @@ STANDARD: dict[str, LocalFeature] = {
         "shi-tomasi-eigenvalue", "Shi-Tomasi, sub-pixel", _shi_tomasi_eigenvalue, "SIFT_create"
     ),
 }
-"""Classical detectors of the standard protocol, which compares the best N keypoints. ORB, Harris
-and Shi-Tomasi differ from `CLASSICAL` so that they find enough keypoints and rank them by score."""
+"""Classical detectors of the standard protocol, which compares the best N keypoints. They differ
+from `CLASSICAL` so that SIFT's positions are exact, and ORB, Harris and Shi-Tomasi find enough
+keypoints and rank them by score."""
 
 
 def with_kd_trees(features: Iterable[LocalFeature]) -> list[LocalFeature]:

@@ -17,7 +17,7 @@ from deepdetect.matching.pipeline import match_images
 
 from ...datasets.posed_images import PosedPair, PosedScene, load_posed_scenes
 from ..baselines.method import LocalFeature
-from ..baselines.opencv import CLASSICAL, STANDARD
+from ..baselines.opencv import STANDARD
 from ..metrics.homography import area_under_curve
 from ..metrics.pose import (
     EPIPOLAR_THRESHOLD_PX,
@@ -125,8 +125,7 @@ def pose_methods(run: Run, options: BenchmarkOptions) -> list[PoseMethod]:
     """Return the methods of DeepDetect, the chosen baselines, and the guess without images."""
     detector, own = options.native_detector(), options.deepdetect_native()
     ways = {"DeepDetect": _match_guided, "DeepDetect, unguided": _match_unguided}
-    chosen = {"sift": CLASSICAL["sift"], "orb": STANDARD["orb"]}
-    classical = [feature for name, feature in chosen.items() if name in options.classical]
+    classical = [STANDARD[name] for name in ("sift", "orb") if name in options.classical]
     features = without_repeats((*classical, *options.others))
     return [
         *(
