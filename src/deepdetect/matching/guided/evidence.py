@@ -109,13 +109,14 @@ def is_repeated(
     sparse: Pair | None = None,
     seed: int = 0,
     distinct: bool = False,
+    flat: bool = False,
 ) -> bool:
     """Return whether a shifted copy of a homography explains the points as well as the original.
 
     `points0`, (N, 2), are positions in the first image of dense matches or, if `distinct`, of
     sparse matches that passed the ratio test. `sparse` are all tentative matches, (M, 2) in each
     image, many of them wrong. Off the plane, the correct ones agree on an epipole relative to the
-    correct homography only.
+    correct homography only. If `flat`, the caller knows that the images show one plane.
     """
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
@@ -130,15 +131,17 @@ def is_repeated(
             continue  # the refinement undid the shift
         compared = _compare(first, second, matrix, other)
         # Matches along one edge fit any shift along it, but the rest of the images may decide.
-        if _preferred(compared[:, places], distinct) or _preferred(compared):
+        if _preferred(compared[:, places], distinct, flat) or _preferred(compared, flat=flat):
             continue
         copy = scaled_homography(other, 1 / scale0, 1 / scale1)
         if sparse and _parallax_decides(first, scale0, sparse, homography, copy, seed):
             continue
+        if not flat:
+            return True
         (large0, by0), (large1, by1) = (downscale(gray, DETAILED_SIDE_PX) for gray in grays)
         own, other = (scaled_homography(each, by0, by1) for each in (homography, copy))
         other = refine_homography(large0, large1, other)
-        if not _preferred(_compare(large0, large1, own, other)):
+        if not _preferred(_compare(large0, large1, own, other), flat=flat):
             return True
     return False
 
@@ -153,20 +156,22 @@ def _compare(
     return np.stack([own, others, np.fmax(*recurring)])
 
 
-def _preferred(compared: np.ndarray, distinct: bool = False) -> bool:
+def _preferred(compared: np.ndarray, distinct: bool = False, flat: bool = False) -> bool:
     """Return whether (3, ...) ZNCCs of `_compare` prefer a homography to its copy.
 
-    Content that recurs one shift away in the first image is no evidence for either: where the
-    pattern ends, or something covers it, its next period may just be hidden.
+    Content that recurs one shift away in the first image is no evidence for the homography: where
+    the pattern ends, its next period may just be hidden. If `flat`, what has been written over a
+    period is no evidence for the copy either.
     """
     own, others, recurring = compared
     best = np.fmax(own, others)  # NaN where both are
     known = (best > MIN_ZNCC) & np.isfinite(own) & np.isfinite(others)
-    recurs = (recurring > MIN_ZNCC) & (recurring > best - MIN_ZNCC_GAIN)
+    recurs = recurring > MIN_ZNCC
+    if flat:
+        recurs &= recurring > best - MIN_ZNCC_GAIN
     gain = (own - others)[known]
-    alone, other_alone = (
-        np.sum((sign * gain > MIN_ZNCC_GAIN) & ~recurs[known]) for sign in (1, -1)
-    )
+    alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
+    other_alone = np.sum((gain < -MIN_ZNCC_GAIN) & ~(flat & recurs[known]))
     if len(gain) < MIN_COMPARED:
         # With so few places, the distinctive descriptors of sparse matches suffice if enough of
         # their patches look alike and the copy alone explains no place.

@@ -147,7 +147,8 @@ def guided_matches(
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
     sparse = None if first.prescribed else first.all_points
     distinct = matches.points0 is not None
-    if plane is not None and is_repeated(grays, *plane, sparse, seed, distinct):
+    flat = first.prescribed and first.model == "homography"
+    if plane is not None and is_repeated(grays, *plane, sparse, seed, distinct, flat):
         return replace(geometry, model="none", matrix=None, scene="none"), None
     own = len(matches)
     matches = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
