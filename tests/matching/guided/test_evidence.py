@@ -88,11 +88,11 @@ def test_what_is_written_in_a_table_tells_its_cells_apart() -> None:
             text = f"{rng.integers(1000, 9999)}"
             cv2.putText(page, text, (x + 20, y + 27), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 30)
     points = np.argwhere(page < 100)[::7, ::-1].astype(np.float64)
-    assert not is_repeated((page, page), points, np.eye(3))
+    assert not is_repeated((page, page), points, np.eye(3), flat=True)
     down = np.array([[1, 0, 0], [0, 1, 40], [0, 0, 1.0]])
-    assert is_repeated((page, page), points, down)
+    assert is_repeated((page, page), points, down, flat=True)
     page[:] = np.tile(page[40:80, 100:200], (28, 8))
-    assert is_repeated((page, page), points, np.eye(3))
+    assert is_repeated((page, page), points, np.eye(3), flat=True)
 
 
 def test_a_scene_that_does_not_repeat_is_not_repeated() -> None:
