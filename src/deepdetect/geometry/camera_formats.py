@@ -470,7 +470,8 @@ def meshroom(values: Values, image: Pair) -> Any:
             focal = [fx, fx * (ratio if version >= [1, 2, 5] else 1 / ratio)]
         centre = np.array(numbers_in(each["principalPoint"])) + size / 2 * (version >= [1, 2, 1])
         own = {"focal": focal, "principal_point": centre, "resolution": size}
-        cameras.append({**own, **{key: each[key] for key in each if "ist" in key or key == "type"}})
+        lens = {key: each[key] for key in each if key == "type" or "dist" in key.lower()}
+        cameras.append({**own, **lens})
     return cameras
 
 

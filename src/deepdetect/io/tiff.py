@@ -236,7 +236,7 @@ def _decoded_by_pillow(file: BinaryIO, stored: list[Any], page: Any, name: str) 
     """
     bits, photometric = page.bitspersample, int(page.photometric)
     grey = photometric == MIN_IS_BLACK and page.samplesperpixel == 1
-    plain = page.dtype.kind in "bu" and (bits in (1, 8) or (bits == 16 and grey))
+    plain = page.dtype.kind in ("b", "u") and (bits in (1, 8) or (bits == 16 and grey))
     if plain and page in stored:
         with suppress(ImageError, OSError), identify(file, name) as image:
             image.seek(stored.index(page))
