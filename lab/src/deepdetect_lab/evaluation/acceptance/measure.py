@@ -34,13 +34,11 @@ FAMILIES: dict[str, Callable[[Path], Iterator[JudgedPair]]] = {
 }
 """The families of pairs, by name."""
 
-ORDERS, F_THRESHOLD_PX, F_CONFIDENCE, F_ITERATIONS = 11, 1.5, 0.9999, 10_000
+ORDERS, F_THRESHOLD_PX, F_CONFIDENCE, F_ITERATIONS, ACCURACY_PX = 11, 1.5, 0.9999, 10_000, 10
 """MAGSAC gets the matches in this number of random orders, because its answer depends on their
-order. Its threshold, confidence and iterations are those with which others report mAA."""
-
-ACCURACY_PX = range(1, 11)
-"""The accuracy is the mean over these limits of the fraction of the places marked by hand that lie
-within the limit of both epipolar lines."""
+order. Its threshold, confidence and iterations are those with which others report mAA: the mean,
+over all whole distances up to the last one, of the fraction of the places marked by hand that lie
+within it of both epipolar lines."""
 
 COLUMNS = {
     **{"kind": "", "answers": ",d", "right": ",d", "wrong, high": ",d", "wrong, fair": ",d"},
@@ -172,7 +170,9 @@ def _accuracy(matches: Matches, places: np.ndarray) -> float:
             found.append(0.0)
             continue
         errors = _both_lines(matrix, places)
-        found.append(float(np.mean([(errors < limit).mean() for limit in ACCURACY_PX])))
+        found.append(
+            float(np.mean([(errors < limit).mean() for limit in range(1, ACCURACY_PX + 1)]))
+        )
     return float(np.mean(found))
 
 

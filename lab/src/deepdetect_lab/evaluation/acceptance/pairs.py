@@ -14,12 +14,10 @@ from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from ...datasets.posed_images import PosedPair
 from ..protocols.pose import ERROR, GOOD_DEG, estimate_pose, pose_errors
 
-RIGHT_PX = 3.0
-"""A correct match has a smaller transfer error on a plane, or distance to its epipolar line
-otherwise. Chosen by hand."""
-
-MIN_CORRECT = 0.5
-"""An answer is right if at least this fraction of its matches is correct."""
+RIGHT_PX, MIN_CORRECT = 3.0, 0.5
+"""A match is correct if its transfer error on a plane, or else its distance from its epipolar line,
+is below the first value. An answer is right if at least the second fraction of its matches is
+correct, because more wrong ones would outvote them."""
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0.0]])
 """Fundamental matrix of a rectified pair."""

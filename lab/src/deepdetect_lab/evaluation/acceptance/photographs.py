@@ -17,16 +17,11 @@ from ...datasets.planar import load_oxford
 from ...datasets.posed_images import load_posed_scenes
 from .pairs import ROWS, UNRELATED, Images, JudgedPair, Truth
 
-MIDDLEBURY_SIDES_PX = (None, 480)
-"""Stereo pairs are matched at their own size, and reduced to this longer side, because thresholds
-in pixels of the image would decide otherwise there."""
-
-FAR_FRAMES = range(15, 26, 5)
-"""Frames of a clip this far apart see the street from clearly different places."""
-
-SAME_PLACE_PX = 5.0
-"""Photographs of one webcam, and exposures of one tripod, fit the identity within a pixel. Wind and
-clouds move the rest, so that the limit is wider than for planes."""
+MIDDLEBURY_SIDES_PX, FAR_FRAMES, SAME_PLACE_PX = (None, 480), range(15, 26, 5), 5.0
+"""Stereo pairs are matched at their own size and reduced to the second longer side, because limits
+in pixels decide otherwise there. Frames of a clip at these distances see the street from other
+places. Images of one webcam or tripod fit the identity within a pixel; a match is correct within
+the last distance, because clouds and wind move the rest."""
 
 
 def read(first: Path, second: Path, side_px: int | None = None) -> Images:

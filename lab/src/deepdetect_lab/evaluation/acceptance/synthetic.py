@@ -23,21 +23,14 @@ from .pairs import ROWS, UNRELATED, Images, JudgedPair, Truth
 PLANES, FACADES, HARD, OVERLAYS, FRAMES, STRIPS = 60, 90, 200, 60, 30, 40
 """Numbers of pairs of each family."""
 
-SIZE = (720, 600)
-"""Width and height of synthetic images in pixels."""
+SIZE, NOISE = (720, 600), 3.0
+"""Width and height of synthetic images in pixels, and the standard deviation of their noise in grey
+levels, about that of a phone indoors."""
 
-NOISE = 3.0
-"""Standard deviation of the noise of synthetic images, in grey levels. Chosen by hand."""
-
-SHARES = (0.1, 0.2, 0.4)
-"""Fractions of the image that planes and overlays cover."""
-
-MIN_ROTATION_DEG = 5.0
-"""Frames are laid on pairs whose cameras rotated by at least this angle, so that the answer of
-images that stand still, no rotation, is clearly wrong."""
-
-ASPECTS = (6, 8, 12, 16)
-"""Widths of strips relative to their heights."""
+SHARES, ASPECTS, MIN_ROTATION_DEG = (0.1, 0.2, 0.4), (6, 8, 12, 16), 5.0
+"""Planes and overlays cover these fractions of the image; strips are this many times as wide as
+high. Frames are laid on pairs whose cameras rotated by at least the last angle, so that the answer
+of images that stand still, no rotation, is clearly wrong."""
 
 
 class Photographs:
