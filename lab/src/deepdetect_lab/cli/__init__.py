@@ -19,6 +19,10 @@ DEVELOPMENT = {
             "deepdetect_lab.cli.evaluate",
             "Compute the paper's tables and figures, with other detectors for comparison.",
         ),
+        "acceptance": (
+            "deepdetect_lab.cli.evaluate",
+            "Let an engine of guided matching answer pairs of all kinds.",
+        ),
         "evaluate": ("deepdetect_lab.cli.evaluate", "Score weights on images with known masks."),
         "compare-clouds": (
             "deepdetect_lab.cli.evaluate",

@@ -1,4 +1,4 @@
-"""Commands that evaluate: `evaluate`, `evaluate-stereo`, `compare-clouds`, `benchmark`."""
+"""Commands that evaluate: weights, stereo, clouds, detectors, and engines of guided matching."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.errors import DeepDetectError, OptionError, noted_failures
 from deepdetect._shared.options import look_up
 from deepdetect.cli import _options as cli
@@ -17,7 +18,8 @@ from deepdetect.detector.pretrained import PRETRAINED
 
 from ..datasets import StereoPair
 from ..datasets.middlebury import load_middlebury
-from ..evaluation.baselines.external import find_feature
+from ..evaluation.acceptance.measure import FAMILIES, NOTE, guided, measure, summary
+from ..evaluation.baselines.external import find_feature, imported
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from ..evaluation.options import BenchmarkOptions
 from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
@@ -166,6 +168,46 @@ def compare_clouds(
     rows = compare(model, [model / "model.ply", *clouds])
     table = Table("clouds", "", CLOUD_COLUMNS, rows, CLOUD_NOTE)
     return cli.Result(rows, f"{table.to_markdown()}\n\n{CLOUD_NOTE}")
+
+
+ACCEPTANCE = cli.From(measure, "seeds every", more="")
+
+
+@cli.command(ACCEPTANCE)
+def acceptance(
+    data: Annotated[Path, Parameter(help="Folder of the data sets.")],
+    /,
+    *,
+    family: list[str] | None = None,
+    engine: str | None = None,
+    output: cli.Output = Path("acceptance"),
+    **values: Any,
+) -> cli.Result:
+    """Let an engine of guided matching answer pairs of all kinds, and count right answers.
+
+    Writes answers.jsonl, with a line for each answer, and acceptance.csv, with a line for each
+    kind of pair. A second run only does what is missing.
+
+        deepdetect dev acceptance data -o today
+        deepdetect dev acceptance data --family facades --every 5 --seeds 1 -o quick
+        deepdetect dev acceptance data --engine my_engine:match -o mine
+
+    Args:
+        family: Which pairs; may be repeated. [default: all]
+        engine: A function MODULE:FUNCTION of two images and a seed that returns matches.
+            [default: match_images]
+        output: Folder for both files.
+    """
+    folder = cli.output_folder(output)
+    for each in family or ():
+        look_up("family", each, FAMILIES)
+    chosen = guided() if engine is None else imported(engine)
+    log, how = folder / "answers.jsonl", ACCEPTANCE.take(values)
+    rows = measure(data, chosen, log, families=family or tuple(FAMILIES), quiet=False, **how)
+    table = summary(rows)
+    with atomic_path(folder / "acceptance.csv") as path:
+        path.write_text(table.to_csv())
+    return cli.Result(table.values(), f"{table.to_markdown()}\n\n{NOTE}")
 
 
 OPTIONS = cli.From(BenchmarkOptions, "max_pairs max_images", more="ranker")

@@ -63,8 +63,8 @@ def find_feature(word: str) -> LocalFeature:
         raise OptionError(f"{error}; or give an ONNX file or package.module:function") from None
 
 
-def plugin_feature(target: str) -> LocalFeature:
-    """Make a local feature from an importable function. Its module may be in the current folder."""
+def imported(target: str) -> Any:
+    """Return the function "package.module:function". Its module may be in the current folder."""
     module, _, name = target.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)
@@ -77,7 +77,13 @@ def plugin_feature(target: str) -> LocalFeature:
     finally:
         sys.path.remove(here)
     if not callable(function):
-        raise OptionError(f"{target} is not a function: it must take an image and return a dict")
+        raise OptionError(f"{target} is not a function: give one as package.module:function")
+    return function
+
+
+def plugin_feature(target: str) -> LocalFeature:
+    """Make a local feature from an importable function, which takes an image."""
+    function, module = imported(target), target.partition(":")[0]
     source = getattr(sys.modules[module], "__file__", None)
     watched = str(Path(source).stat().st_mtime_ns) if source else "1"
     version = f"{getattr(function, 'version', '')} {watched}"

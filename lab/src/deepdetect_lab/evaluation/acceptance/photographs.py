@@ -1,0 +1,99 @@
+"""Pairs of photographs with known geometry, in the layouts of the benchmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from deepdetect._shared.opencv import cv2
+from deepdetect.geometry.images import downscale
+from deepdetect.io.image import load_image
+
+from ...datasets.planar import load_oxford
+from ...datasets.posed_images import load_posed_scenes
+from .pairs import ROWS, UNRELATED, Images, JudgedPair, Truth
+
+MIDDLEBURY_SIDES_PX, FAR_FRAMES, SAME_PLACE_PX = (None, 480), range(15, 26, 5), 5.0
+"""Stereo pairs are matched at their own size and reduced to the second longer side, because limits
+in pixels decide otherwise there. Frames of a clip at these distances see the street from other
+places. Images of one webcam or tripod fit the identity within a pixel; a match is correct within
+the last distance, because clouds and wind move the rest."""
+
+
+def read(first: Path, second: Path, side_px: int | None = None) -> Images:
+    """Read two images, reduced to a longer side if one is given."""
+    images = load_image(first), load_image(second)
+    if side_px is None:
+        return images
+    return downscale(images[0], side_px)[0], downscale(images[1], side_px)[0]
+
+
+def oxford(data: Path) -> Iterator[JudgedPair]:
+    """Yield image 1 with each other image of the scenes of Oxford."""
+    for scene in load_oxford(data / "oxford", "refined"):
+        for pair in scene.pairs:
+            make = partial(read, pair.first, pair.second)
+            yield JudgedPair("oxford", pair.name, make, Truth(pair.homography))
+
+
+def middlebury(data: Path) -> Iterator[JudgedPair]:
+    """Yield rectified pairs of scenes with depth, at two sizes."""
+    for left in sorted(data.glob("middlebury/*/left.png")):
+        for side in MIDDLEBURY_SIDES_PX:
+            kind = f"middlebury, {side or 'native'}"
+            make = partial(read, left, left.with_name("right.png"), side)
+            yield JudgedPair(kind, left.parent.name, make, Truth(fundamental=ROWS, depth=True))
+
+
+def posed(data: Path) -> Iterator[JudgedPair]:
+    """Yield pairs of scenes with known cameras. The pose of an answer decides."""
+    for scene in load_posed_scenes(data):
+        for pair in scene.pairs:
+            far = pair.frame_distance is not None and pair.frame_distance in FAR_FRAMES
+            kind = f"{scene.name}, far apart" if far else scene.name
+            make = partial(read, pair.first.path, pair.second.path)
+            truth = Truth(fundamental=pair.fundamental, posed=pair)
+            yield JudgedPair(kind, pair.name, make, truth)
+
+
+def wide(data: Path) -> Iterator[JudgedPair]:
+    """Yield pairs of wide baselines, seasons and light, with places marked by hand."""
+    for marked in sorted(data.glob("wide/*/correspondences.txt")):
+        first, second = (next(marked.parent.glob(f"{number}.*")) for number in (0, 1))
+        places = np.loadtxt(marked).reshape(-1, 4)
+        matrix, _ = cv2.findFundamentalMat(places[:, :2], places[:, 2:], cv2.FM_LMEDS)
+        truth = Truth(fundamental=matrix, right_px=10.0)  # the marks are off by pixels
+        make = partial(read, first, second)
+        yield JudgedPair("wide", marked.parent.name, make, truth, places)
+
+
+def webcams(data: Path) -> Iterator[JudgedPair]:
+    """Yield all pairs of photographs of one webcam, in other light, season and weather."""
+    for folder in sorted(data.glob("webcams/*")):
+        for first, second in combinations(sorted(folder.glob("*.jpg")), 2):
+            name = f"{folder.name} {first.stem}-{second.stem}"
+            truth = Truth(np.eye(3), right_px=SAME_PLACE_PX)
+            yield JudgedPair("webcams", name, partial(read, first, second), truth)
+
+
+def exposures(data: Path) -> Iterator[JudgedPair]:
+    """Yield all pairs of exposures of one tripod."""
+    for folder in sorted(data.glob("hdr/*")):
+        for first, second in combinations(sorted(folder.glob("*.png")), 2):
+            name = f"{folder.name} {first.stem}-{second.stem}"
+            truth = Truth(np.eye(3), right_px=SAME_PLACE_PX)
+            yield JudgedPair("exposures", name, partial(read, first, second), truth)
+
+
+def unrelated(data: Path) -> Iterator[JudgedPair]:
+    """Yield all pairs of photographs of different things."""
+    places = [*sorted(data.glob("oxford/*/img1.*")), *sorted(data.glob("middlebury/*/left.png"))]
+    things = sorted(data.glob("foreground/*.jpg"))
+    others = zip(things, [*things[1:], *things[:1]], strict=True)
+    for first, second in (*combinations(places, 2), *others):
+        name = f"{first.parent.name} {first.stem}-{second.parent.name} {second.stem}"
+        yield JudgedPair("unrelated", name, partial(read, first, second), UNRELATED)
