@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -73,20 +73,20 @@ def wide(data: Path) -> Iterator[JudgedPair]:
 
 def webcams(data: Path) -> Iterator[JudgedPair]:
     """Yield all pairs of photographs of one webcam, in other light, season and weather."""
-    for folder in sorted(data.glob("webcams/*")):
-        for first, second in combinations(sorted(folder.glob("*.jpg")), 2):
-            name = f"{folder.name} {first.stem}-{second.stem}"
-            truth = Truth(np.eye(3), right_px=SAME_PLACE_PX)
-            yield JudgedPair("webcams", name, partial(read, first, second), truth)
+    yield from _from_one_place("webcams", data.glob("webcams/*"), "*.jpg")
 
 
 def exposures(data: Path) -> Iterator[JudgedPair]:
     """Yield all pairs of exposures of one tripod."""
-    for folder in sorted(data.glob("hdr/*")):
-        for first, second in combinations(sorted(folder.glob("*.png")), 2):
+    yield from _from_one_place("exposures", data.glob("hdr/*"), "*.png")
+
+
+def _from_one_place(kind: str, folders: Iterable[Path], pattern: str) -> Iterator[JudgedPair]:
+    for folder in sorted(folders):
+        for first, second in combinations(sorted(folder.glob(pattern)), 2):
             name = f"{folder.name} {first.stem}-{second.stem}"
             truth = Truth(np.eye(3), right_px=SAME_PLACE_PX)
-            yield JudgedPair("exposures", name, partial(read, first, second), truth)
+            yield JudgedPair(kind, name, partial(read, first, second), truth)
 
 
 def unrelated(data: Path) -> Iterator[JudgedPair]:
