@@ -403,7 +403,7 @@ def test_no_refusal_where_the_number_is_zero(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore:the principal point")
 def test_any_3x3_matrix_is_a_camera_or_refused(tmp_path: Path) -> None:
-    """Of two hundred random matrices, those that are read are the camera's matrix themselves."""
+    """Each of two hundred random matrices that is read is the camera's matrix itself."""
     generator = np.random.default_rng(5)
     read = 0
     for _ in range(200):

@@ -63,7 +63,7 @@ def test_descriptors_without_weights_are_refused() -> None:
 
 
 def test_scales_and_angles_are_as_kornia_makes_them_of_frames(views: Views) -> None:
-    """Of its frames kornia gives LightGlue a sixth of the scale, and the negative angle."""
+    """Kornia gives LightGlue a sixth of the scale of its frames, and the negative angle."""
     feature = pytest.importorskip("kornia.feature", reason="needs kornia")
     from deepdetect.integrations.kornia import DeepDetectDetector
 

@@ -14,7 +14,7 @@ from deepdetect.matching.guided.epipolar_search import (
 )
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-"""Of a rectified pair: epipolar lines are the rows."""
+"""The fundamental matrix of a rectified pair, whose epipolar lines are the rows."""
 
 SIZE = (400, 300)
 

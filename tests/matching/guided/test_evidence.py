@@ -168,7 +168,7 @@ def test_matches_of_a_pattern_at_random_periods_do_not_move_alike() -> None:
 
 
 def test_as_many_move_alike_as_brute_force_finds() -> None:
-    """Of matches of which some begin at one place; each is compared with its eight nearest."""
+    """Some matches begin at one place; each match is compared with its eight nearest."""
     rng = np.random.default_rng(0)
     points0 = rng.uniform(0, 900, (1100, 2))
     points1 = points0 @ [[0.6, 0.5], [-0.5, 0.7]] + rng.normal(0, 9, points0.shape)

@@ -54,7 +54,7 @@ def edges(gray: np.ndarray) -> np.ndarray:
 
 
 def seen_again(gray: np.ndarray) -> np.ndarray:
-    """The same scene in other light, with noise."""
+    """The function returns the same scene in other light, with noise."""
     noise = np.random.default_rng(0).normal(0, 4, gray.shape)
     return np.clip(gray * 0.8 + 20 + noise, 0, 255).astype(np.uint8)
 
@@ -98,7 +98,7 @@ def test_under_another_photograph_next_to_nothing_agrees(
 
 @pytest.mark.parametrize("name", ["astronaut", pytest.param("coffee", marks=pytest.mark.slow)])
 def test_few_null_pairs_pass(picture: Callable[..., np.ndarray], name: str) -> None:
-    """Of an image shifted by other shares of its size than those of the null pairs."""
+    """The image is shifted by other shares of its size than the null pairs are."""
     gray = picture(name, 2 * HALF)
     shares = []
     for across, down in ((0.25, 0.4), (0.4, 0.75), (0.6, 0.2), (0.75, 0.6)):
