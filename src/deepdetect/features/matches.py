@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -136,29 +136,6 @@ class GuidedMatches:
         return GuidedMatches(*columns, self.subpixel, indices1)
 
 
-class _Lazy:
-    """A field that holds keypoints, or a function that finds them on first access."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, instance: Any, owner: type | None = None) -> Keypoints:
-        if instance is None:
-            raise AttributeError(self.name)  # tells `dataclass` that the field has no default
-        keypoints = instance.__dict__[self.name]
-        if not isinstance(keypoints, Keypoints):
-            keypoints = instance.__dict__[self.name] = keypoints()
-        return keypoints
-
-    def __set__(self, instance: Any, value: Any) -> None:
-        instance.__dict__[self.name] = value
-
-
-def lazy(find: Callable[[], Keypoints]) -> Keypoints:
-    """Wrap a function that finds keypoints as a field of `Matches`, called on first access."""
-    return cast(Keypoints, find)
-
-
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Matches:
@@ -170,15 +147,12 @@ class Matches:
             guided the matching, `points0` are pixels with keypoints, and `points1` the places where
             the second image shows these pixels; with `mutual`, the images may have swapped these
             roles. Otherwise all positions are keypoints.
-        scores: (M,) float32 in [0, 1], higher is better. If a homography guided the matching, 1 -
-            the dissimilarity of the two patches (at a score of 0, they are just more similar than
-            unrelated patches). If a fundamental matrix guided the matching, the correlation of the
-            patches. Otherwise, 1 - Lowe's ratio.
+        scores: (M,) float32 in [0, 1], higher is better. If geometry guided the matching,
+            the correlation of both patches or of their descriptors. Otherwise, 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
             `GeometryOptions.inlier_threshold`; all matches if there is no geometry yet. Guided
             matches that the surrounding image contradicts are no inliers.
-        keypoints0, keypoints1: all keypoints of the two images. If no geometry was found, they may
-            be detected only when they are first accessed.
+        keypoints0, keypoints1: all keypoints of the two images.
         seconds: time of each stage of the matching, for both images together, by the stage's name.
         geometry: the geometry between the images; None for `match_features`, which estimates none.
         subpixel: whether the matching itself found sub-pixel positions in the second image, on the
@@ -211,8 +185,8 @@ class Matches:
     points1: np.ndarray
     scores: np.ndarray
     inliers: np.ndarray
-    keypoints0: Keypoints = _Lazy()  # type: ignore[assignment]
-    keypoints1: Keypoints = _Lazy()  # type: ignore[assignment]
+    keypoints0: Keypoints
+    keypoints1: Keypoints
     seconds: dict[str, float] = field(default_factory=dict)
     geometry: TwoViewGeometry | None = None
     subpixel: bool = False

@@ -39,7 +39,7 @@ from ..stereo.matching import (
     range_with_margin,
 )
 from ..stereo.sgm import DisparityRange
-from .tentative_matches import Pair
+from .image_pair import Pair
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """Options for matching rows. The range of disparities is set for each pair."""

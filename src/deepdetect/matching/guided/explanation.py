@@ -1,0 +1,305 @@
+"""Explain a pair of images: propose geometries, judge them, take the best, explain the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..._shared.errors import ImageError
+from ...features.keypoints import Keypoints, nearest_keypoints
+from ...features.matches import Evidence as PublicEvidence
+from ...features.matches import GuidedMatches, TwoViewGeometry
+from ...geometry.images import edge_strength
+from ...geometry.lens import UNDISTORT, distortion
+from ...geometry.transforms import transfer_errors
+from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
+from .along_plane import match_along_plane, refined
+from .along_rows import match_by_rectification
+from .image_pair import ImagePair, Pair
+from .judge import Evidence, Judge
+from .parallax import measure_parallax
+from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
+
+MIN_MATCHED_FRACTION = 0.02
+"""Dense matching has failed if it matches less than this fraction of the keypoints."""
+
+MIN_PLANE_RATIO = 0.67
+"""A scene has depth if a homography explains less than this fraction of the matches that agree with
+a fundamental matrix."""
+
+MAX_SPARSE_LOG10_NFA = -12.0
+"""Without dense matches, sparse ones are an answer if the log10 number of false alarms is below
+this."""
+
+OFF_RATIO = 4.0
+"""Tentative matches with errors above this multiple of the inlier threshold are not explained."""
+
+MAX_LAYERS = 4
+"""Maximum number of geometries of one pair: one of the scene, others of what moves on its own."""
+
+HIGH_SHARE, HIGH_LOG10_NFA = 0.2, -12.0
+"""The confidence is "high" only if the images confirm at least this fraction of the compared
+windows, and the log10 number of false alarms is below the second value."""
+
+SCENE_MATCHES, DOMINANT_FRACTION = 1000, 0.5
+"""A plane is dominant if at least this fraction of so many random dense matches lies on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """What one geometry explains."""
+
+    hypothesis: Hypothesis
+    matches: GuidedMatches
+    evidence: Evidence
+
+    @property
+    def dense(self) -> bool:
+        """Whether the matches are dense."""
+        return self.matches.points0 is None
+
+
+class Explanation:
+    """The layers of a pair, the one that explains most first."""
+
+    def __init__(
+        self,
+        pair: ImagePair,
+        keypoints: tuple[Keypoints, Keypoints],
+        asked: str = "auto",
+        given: Pair | Tentative | None = None,
+        seed: int = 0,
+    ) -> None:
+        self._pair, self._asked, self._seed = pair, asked, seed
+        self.pixels = np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)
+        self._sources = Sources(pair, given, keypoints)
+        self._judges: dict[bool, tuple[ImagePair, Judge]] = {}
+        self.tried = Tentative(np.empty((0, 2)), np.empty((0, 2)))
+        self.best_nfa = np.inf
+        self.refuted = False
+
+    @cached_property
+    def layers(self) -> list[Layer]:
+        """The layers."""
+        layers: list[Layer] = []
+        fallback: Layer | None = None
+        for tentative in self._sources:
+            self.tried = tentative
+            found = next(self._confirmed(tentative), None)
+            if self.refuted:
+                return []
+            if found is not None and found.dense:
+                layers.append(found)
+                break
+            if found is not None and (
+                fallback is None or found.hypothesis.log10_nfa < fallback.hypothesis.log10_nfa
+            ):
+                fallback = found
+        if not layers:
+            return [] if fallback is None else [fallback]
+        free = np.ones(len(tentative.points0), bool)
+        explained = layers[0].evidence.explained
+        if self._asked != "auto":
+            return layers
+        while len(layers) < MAX_LAYERS:
+            last = layers[-1].hypothesis
+            errors = last.errors(tentative.points0, tentative.points1)
+            free &= errors > OFF_RATIO * last.threshold_px
+            further = next(self._confirmed(tentative.chosen(free), ~explained), None)
+            if further is None or not further.dense:
+                break
+            layers.append(further)
+            explained = explained | further.evidence.explained
+        return layers
+
+    def _seen(self, cross_modal: bool) -> tuple[ImagePair, Judge]:
+        if cross_modal not in self._judges:
+            pair = self._pair
+            if cross_modal:
+                first, second = (edge_strength(gray) for gray in pair.grays)
+                pair = ImagePair((first, second))
+            self._judges[cross_modal] = pair, Judge(pair)
+        return self._judges[cross_modal]
+
+    def _confirmed(self, tentative: Tentative, free: np.ndarray | None = None) -> Iterator[Layer]:
+        """Yield layers that the images confirm, the best first, then sparse ones."""
+        pair, judge = self._seen(tentative.cross_modal)
+        epipolar, refuted = None, np.zeros(len(tentative.points0), bool)
+        if self._asked != "homography":
+            epipolar = propose(pair, tentative, "fundamental", self._seed)
+        flat: Layer | None = None
+        sparse: list[Hypothesis] = []
+        for plane in planes(pair, tentative, self._seed) if self._asked != "fundamental" else ():
+            self.best_nfa = min(self.best_nfa, plane.log10_nfa)
+            matrix = refined(pair, plane.matrix)
+            view = judge.along_plane(matrix)
+            evidence = self._on_free(view.evidence, free)
+            if not evidence.confirms:
+                sparse.append(plane)
+                continue
+            if view.repeated:
+                refuted |= plane.inliers
+                continue
+            plane = replace(plane, matrix=matrix)
+            matches = match_along_plane(pair, self.pixels, matrix, judge, evidence)
+            if len(matches) >= self._enough:
+                flat = Layer(plane, matches, evidence)
+            break
+        if epipolar is not None and self._mostly(refuted, epipolar.inliers):
+            epipolar = None  # it explains the same pattern
+        if epipolar is not None:
+            self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
+            deep = flat is None or self._is_deep(pair, flat, epipolar)
+            layer = self._along_rows(pair, judge, epipolar, flat, free) if deep else None
+            if layer is not None:
+                yield layer
+            else:
+                sparse.append(epipolar)
+        if flat is not None and not self._is_part(flat.hypothesis, epipolar):
+            yield flat
+        self.refuted = free is None and refuted.any() and flat is None and epipolar is None
+        sparse = [each for each in sparse if each.log10_nfa < MAX_SPARSE_LOG10_NFA]
+        if not self.refuted and sparse and free is None:
+            best = min(sparse, key=lambda each: each.log10_nfa)
+            layer = self._sparse(best)
+            if layer is not None:
+                yield layer
+
+    def _is_part(self, plane: Hypothesis, epipolar: Hypothesis | None) -> bool:
+        """Return whether a plane is only a part of a scene with depth."""
+        return epipolar is not None and not self._mostly(plane.inliers, epipolar.inliers)
+
+    def _mostly(self, some: np.ndarray, inliers: np.ndarray) -> bool:
+        """Return whether a plane with some matches explains most of the other inliers, too."""
+        return np.count_nonzero(some) >= MIN_PLANE_RATIO * np.count_nonzero(inliers)
+
+    def _is_deep(self, pair: ImagePair, flat: Layer, epipolar: Hypothesis) -> bool:
+        """Return whether a scene has depth, given a plane in it."""
+        if self._is_part(flat.hypothesis, epipolar):
+            return True
+        agreeing = epipolar.inliers | flat.hypothesis.inliers
+        ends = epipolar.tentative.chosen(agreeing)
+        parallax = measure_parallax(
+            pair, flat.hypothesis.matrix, (ends.points0, ends.points1), self._seed
+        )
+        return parallax.shows_depth
+
+    def _along_rows(
+        self,
+        pair: ImagePair,
+        judge: Judge,
+        epipolar: Hypothesis,
+        flat: Layer | None,
+        free: np.ndarray | None,
+    ) -> Layer | None:
+        plane = None if flat is None else flat.hypothesis.matrix
+        dense = match_by_rectification(
+            pair.grays, self.pixels[0], epipolar.points, epipolar.matrix, plane=plane
+        )
+        if dense is None or len(dense[1]) < self._enough:
+            return None
+        matrix, matches = dense
+        view = judge.along_matches(matches.starts(self.pixels[0]), matches.points1)
+        evidence = self._on_free(view.evidence, free)
+        if not evidence.confirms or view.repeated:
+            return None
+        if free is not None:
+            inside = evidence.explained[judge.cells_of(matches.starts(self.pixels[0]))]
+            matches = GuidedMatches(
+                matches.indices0[inside], matches.points1[inside], matches.scores[inside], True
+            )
+        return Layer(replace(epipolar, matrix=matrix), matches, evidence)
+
+    def _sparse(self, hypothesis: Hypothesis) -> Layer | None:
+        points0, points1 = hypothesis.points
+        rows, distances = nearest_keypoints(points0, self.pixels[0], self._pair.sizes[0])
+        rows = np.where(np.isfinite(distances), rows, -1).astype(np.int64)
+        scores = np.ones(len(rows), np.float32)
+        matches = GuidedMatches(rows, points1, scores, subpixel=True, points0=points0)
+        nothing = Evidence(np.full((1, 1), np.nan), 1.0, 1.0)
+        return Layer(hypothesis, matches, nothing) if len(rows) >= MIN_MATCHES else None
+
+    def _on_free(self, evidence: Evidence, free: np.ndarray | None) -> Evidence:
+        if free is None:
+            return evidence
+        return replace(evidence, similarity=np.where(free, evidence.similarity, np.nan))
+
+    @cached_property
+    def _enough(self) -> float:
+        return max(MIN_MATCHED_FRACTION * min(len(xy) for xy in self.pixels), MIN_MATCHES)
+
+    def answer(self) -> tuple[TwoViewGeometry, GuidedMatches | None]:
+        """Return the geometry of the first layer, and the matches of all."""
+        tried = len(self.tried.points0)
+        if not self.layers:
+            evidence = PublicEvidence(tried, 0, self.best_nfa, self.tried.views)
+            return TwoViewGeometry("none", evidence=evidence), None
+        first = self.layers[0]
+        own = first.hypothesis
+        matches = first.matches
+        for layer in self.layers[1:]:
+            new = ~np.isin(layer.matches.indices0, matches.indices0)
+            matches = matches.joined(layer.matches, new)
+        starts = matches.starts(self.pixels[0])
+        alike = np.ones(len(matches), bool)
+        if first.dense and own.model == "fundamental":
+            _, judge = self._seen(own.tentative.cross_modal)
+            cells = judge.cells_of(starts)
+            seen = first.evidence.similarity[cells]
+            for layer in self.layers[1:]:
+                seen = np.fmax(seen, layer.evidence.similarity[cells])
+            alike = ~(seen <= first.evidence.bound)
+        high = first.dense and first.evidence.share >= HIGH_SHARE
+        high = high and own.log10_nfa < HIGH_LOG10_NFA
+        evidence = PublicEvidence(
+            len(own.tentative.points0),
+            int(np.count_nonzero(own.inliers)),
+            float(own.log10_nfa),
+            own.tentative.views,
+            verified=first.evidence.share,
+            correlation=float(np.nanmedian(first.evidence.similarity)) if first.dense else 0.0,
+        )
+        geometry = TwoViewGeometry(
+            own.model, own.matrix, "none", "high" if high else "fair", evidence
+        )
+        geometry = self._with_scene(geometry, starts, matches.points1)
+        return geometry, replace(matches, alike=alike)
+
+    def _with_scene(
+        self, geometry: TwoViewGeometry, points0: np.ndarray, points1: np.ndarray
+    ) -> TwoViewGeometry:
+        some = np.random.default_rng(self._seed).permutation(len(points0))[:SCENE_MATCHES]
+        ends = points0[some].astype(np.float64), points1[some]
+        if geometry.model == "homography":
+            rotation = is_usual_rotation(*ends, self._pair.sizes)
+            evidence = replace(geometry.evidence, on_plane=len(points0))
+            return replace(geometry, scene="rotation" if rotation else "planar", evidence=evidence)
+        plane = fit_model(
+            *ends,
+            "homography",
+            self._pair.sizes[1],
+            GUIDING_THRESHOLDS_PX["homography"],
+            self._seed,
+        )
+        if plane.matrix is None or np.mean(plane.inliers) < DOMINANT_FRACTION:
+            return replace(geometry, scene="depth")
+        off = (
+            transfer_errors(points0, points1, plane.matrix)
+            > 2 * GUIDING_THRESHOLDS_PX["homography"]
+        )
+        count = int(np.count_nonzero(off))
+        evidence = replace(geometry.evidence, on_plane=len(points0) - count, off_plane=count)
+        return replace(geometry, scene="depth with a dominant plane", evidence=evidence)
+
+
+def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
+    """Raise an ImageError if a lens that bends lines fits the matches better than a pinhole."""
+    ends = hypothesis.tentative.points0, hypothesis.tentative.points1
+    if distortion(*ends, hypothesis.inliers, pair.sizes):
+        raise ImageError(
+            "the lens of both images bends straight lines, as that of a fisheye, which no "
+            f"pinhole geometry fits: {UNDISTORT}"
+        )
