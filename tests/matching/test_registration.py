@@ -18,7 +18,7 @@ from deepdetect import (
     match_images,
 )
 from deepdetect.io.image import luma
-from deepdetect.matching.registration import MAX_UNION, Registration, _union, agree, register
+from deepdetect.matching.registration import MAX_UNION, Registration, _union, register
 from deepdetect_lab.evaluation.metrics.homography import corner_error
 
 WARP = np.array([[0.92, -0.1, 25.0], [0.08, 0.97, -6.0], [1e-4, 2e-4, 1.0]])

@@ -33,17 +33,17 @@ class Evidence:
 
     Attributes:
         tentative_matches: number of tentative matches from which the geometry was first estimated.
-        tentative_inliers: number of tentative matches that agree with the geometry, plus further
-            matches that were found along its epipolar lines.
+        tentative_inliers: number of tentative matches that agree with the geometry.
         log10_nfa: decimal logarithm of the geometry's number of false alarms (a contrario): the
             expected number of geometries with as many inliers among random matches.
         simulated_views: number of views that were simulated to find the geometry, as in ASIFT.
         on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
-        verified: fraction of the matches proposed by the geometry that the images confirm. If only
-            sparse matches are returned, the `tentative_inliers` are the proposed matches.
-        correlation: median ZNCC between windows of the first image and their places in the second.
-            Each place is predicted by the matches around a window, not by those inside it, so it
-            shows the same content if the matches are correct. 0 if there are few matches.
+        verified: fraction of what both images show in common that the geometry explains: places
+            that are more similar than nearly all places of displaced copies.
+        agreement: fraction of the places with structure that do not contradict the geometry.
+        correlation: median correlation of the descriptors at places with structure. In a scene with
+            depth, the place in the second image is predicted by the matches around, not by those
+            at the place itself. 0 if there are few matches.
         left_out: share of the image that was left out, because it stands still while the scene
             moves: a frame, a caption, a logo, the own vehicle.
     """
@@ -55,6 +55,7 @@ class Evidence:
     on_plane: int = 0
     off_plane: int = 0
     verified: float = 0.0
+    agreement: float = 0.0
     correlation: float = 0.0
     left_out: float = 0.0
 

@@ -153,7 +153,11 @@ def _contradicted(still: np.ndarray, pair: Pair, seed: int) -> np.ndarray:
     motion = tentative.points1 - tentative.points0
     moves = np.linalg.norm(motion, axis=1) > MAX_STILL_PX
     standing, scene, motion = tentative.points0[~moves], tentative.points0[moves], motion[moves]
-    found = propose(both, tentative.chosen(moves), "fundamental", seed)
+    proposed = (
+        propose(both, tentative.chosen(moves), model, seed)
+        for model in ("homography", "fundamental")
+    )
+    found = min(filter(None, proposed), key=lambda each: each.log10_nfa, default=None)
     exactly = still & known & (np.linalg.norm(shift, axis=2) < MAX_SHIFT_PX)
     column, row = np.rint(scene).astype(int).T
     if found is None:

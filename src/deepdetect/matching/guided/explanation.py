@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -131,9 +131,13 @@ class Explanation:
         if self._asked != "homography":
             epipolar = propose(pair, tentative, "fundamental", self._seed)
         flat: Layer | None = None
+        part: Hypothesis | None = None
         sparse: list[Hypothesis] = []
         for plane in planes(pair, tentative, self._seed) if self._asked != "fundamental" else ():
             self.best_nfa = min(self.best_nfa, plane.log10_nfa)
+            if self._is_part(plane, epipolar):
+                part = plane
+                break
             matrix = refined(pair, plane.matrix)
             view = judge.along_plane(matrix)
             evidence = self._on_free(view.evidence, free)
@@ -152,13 +156,14 @@ class Explanation:
             epipolar = None  # it explains the same pattern
         if epipolar is not None:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
-            deep = flat is None or self._is_deep(pair, flat, epipolar)
-            layer = self._along_rows(pair, judge, epipolar, flat, free) if deep else None
+            deep = flat is None or self._is_deep(pair, flat.hypothesis, epipolar)
+            ways = (None, part) if flat is None else (flat.hypothesis,)
+            layer = self._along_rows(pair, judge, epipolar, ways, free) if deep else None
             if layer is not None:
                 yield layer
             else:
                 sparse.append(epipolar)
-        if flat is not None and not self._is_part(flat.hypothesis, epipolar):
+        if flat is not None:
             yield flat
         self.refuted = free is None and refuted.any() and flat is None and epipolar is None
         sparse = [each for each in sparse if each.log10_nfa < MAX_SPARSE_LOG10_NFA]
@@ -176,41 +181,40 @@ class Explanation:
         """Return whether a plane with some matches explains most of the other inliers, too."""
         return np.count_nonzero(some) >= MIN_PLANE_RATIO * np.count_nonzero(inliers)
 
-    def _is_deep(self, pair: ImagePair, flat: Layer, epipolar: Hypothesis) -> bool:
-        """Return whether a scene has depth, given a plane in it."""
-        if self._is_part(flat.hypothesis, epipolar):
-            return True
-        agreeing = epipolar.inliers | flat.hypothesis.inliers
-        ends = epipolar.tentative.chosen(agreeing)
-        parallax = measure_parallax(
-            pair, flat.hypothesis.matrix, (ends.points0, ends.points1), self._seed
-        )
-        return parallax.shows_depth
+    def _is_deep(self, pair: ImagePair, plane: Hypothesis, epipolar: Hypothesis) -> bool:
+        """Return whether a scene has depth that a plane does not explain."""
+        agreeing = epipolar.tentative.chosen(epipolar.inliers | plane.inliers)
+        ends = agreeing.points0, agreeing.points1
+        return measure_parallax(pair, plane.matrix, ends, self._seed).shows_depth
 
     def _along_rows(
         self,
         pair: ImagePair,
         judge: Judge,
         epipolar: Hypothesis,
-        flat: Layer | None,
+        planes: Sequence[Hypothesis | None],
         free: np.ndarray | None,
     ) -> Layer | None:
-        plane = None if flat is None else flat.hypothesis.matrix
-        dense = match_by_rectification(
-            pair.grays, self.pixels[0], epipolar.points, epipolar.matrix, plane=plane
-        )
-        if dense is None or len(dense[1]) < self._enough:
+        """Match along epipolar lines, also in images that a plane makes alike; None if rejected."""
+        for plane in dict.fromkeys(planes):
+            matrix = None if plane is None else plane.matrix
+            dense = match_by_rectification(
+                pair.grays, self.pixels[0], epipolar.points, epipolar.matrix, plane=matrix
+            )
+            if dense is not None and len(dense[1]) >= self._enough:
+                break
+        else:
             return None
         matrix, matches = dense
-        view = judge.along_matches(matches.starts(self.pixels[0]), matches.points1)
+        starts = matches.starts(self.pixels[0])
+        view = judge.along_matches(starts, matches.points1)
         evidence = self._on_free(view.evidence, free)
         if not evidence.confirms or view.repeated:
             return None
         if free is not None:
-            inside = evidence.explained[judge.cells_of(matches.starts(self.pixels[0]))]
-            matches = GuidedMatches(
-                matches.indices0[inside], matches.points1[inside], matches.scores[inside], True
-            )
+            inside = evidence.explained[judge.cells_of(starts)]
+            columns = matches.indices0, matches.points1, matches.scores
+            matches = GuidedMatches(*(each[inside] for each in columns), subpixel=True)
         return Layer(replace(epipolar, matrix=matrix), matches, evidence)
 
     def _sparse(self, hypothesis: Hypothesis) -> Layer | None:
@@ -219,7 +223,8 @@ class Explanation:
         rows = np.where(np.isfinite(distances), rows, -1).astype(np.int64)
         scores = np.ones(len(rows), np.float32)
         matches = GuidedMatches(rows, points1, scores, subpixel=True, points0=points0)
-        nothing = Evidence(np.full((1, 1), np.nan), 1.0, 1.0)
+        nowhere = np.zeros((1, 1), bool)
+        nothing = Evidence(np.full((1, 1), np.nan), 1.0, 1.0, nowhere, nowhere)
         return Layer(hypothesis, matches, nothing) if len(rows) >= MIN_MATCHES else None
 
     def _on_free(self, evidence: Evidence, free: np.ndarray | None) -> Evidence:
@@ -239,6 +244,8 @@ class Explanation:
             return TwoViewGeometry("none", evidence=evidence), None
         first = self.layers[0]
         own = first.hypothesis
+        if self._asked != "homography":
+            straight_lines(self._pair, own)
         matches = first.matches
         for layer in self.layers[1:]:
             new = ~np.isin(layer.matches.indices0, matches.indices0)
@@ -248,10 +255,9 @@ class Explanation:
         if first.dense and own.model == "fundamental":
             _, judge = self._seen(own.tentative.cross_modal)
             cells = judge.cells_of(starts)
-            seen = first.evidence.similarity[cells]
+            alike = ~first.evidence.contradicted[cells]
             for layer in self.layers[1:]:
-                seen = np.fmax(seen, layer.evidence.similarity[cells])
-            alike = ~(seen <= first.evidence.bound)
+                alike |= layer.evidence.explained[cells]
         high = first.dense and first.evidence.share >= HIGH_SHARE
         high = high and own.log10_nfa < HIGH_LOG10_NFA
         evidence = PublicEvidence(
@@ -260,7 +266,8 @@ class Explanation:
             float(own.log10_nfa),
             own.tentative.views,
             verified=first.evidence.share,
-            correlation=float(np.nanmedian(first.evidence.similarity)) if first.dense else 0.0,
+            agreement=first.evidence.agreement,
+            correlation=first.evidence.correlation,
         )
         geometry = TwoViewGeometry(
             own.model, own.matrix, "none", "high" if high else "fair", evidence

@@ -34,8 +34,9 @@ covers a square of six diameters."""
 DIMENSIONS = 64
 """Descriptors are reduced to this number of principal components of the first image."""
 
-FALSE_POSITIVE_RATE = 0.01
-"""Fraction of the cells of displaced copies that pass for explained."""
+FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
+"""Fractions of the cells of displaced copies that pass for explained, and whose surroundings do not
+pass for contradicted: a single cell needs more evidence than a doubt needs against many."""
 
 FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
 """Displacements of the copies that show what chance looks like, as fractions of width and height.
@@ -53,6 +54,10 @@ MIN_WON, MIN_WON_RATIO = 0.025, 2.0
 """A geometry must explain at least the first fraction of the cells clearly better than a copy does,
 and the second value times as many as the copy explains better. On facades with one window that is
 unlike the others, the fraction is 0.032 or more; if all are alike, 0.019 or less for some copy."""
+
+MIN_GRADIENT = 4.0
+"""Mean difference, in grey levels, of pixels two apart, above which a place shows more than noise.
+Noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
 
 MIN_TIED = 0.5
 """A copy competes with a geometry if it explains at least this fraction of its cells as well."""
@@ -82,11 +87,16 @@ class Evidence:
         similarity: (rows, columns) correlation of each cell with its place; NaN if unknown.
         bound: correlation above which a cell is explained.
         spread: standard deviation of the correlations of unrelated cells.
+        contradicted: (rows, columns) bool, where not even the surroundings of a cell, on average,
+            are more similar than those of unrelated cells.
+        structured: (rows, columns) bool, where both images show more than noise.
     """
 
     similarity: np.ndarray
     bound: float
     spread: float
+    contradicted: np.ndarray
+    structured: np.ndarray
 
     @cached_property
     def explained(self) -> np.ndarray:
@@ -100,6 +110,19 @@ class Evidence:
         known = np.isfinite(self.similarity)
         by_chance = FALSE_POSITIVE_RATE * np.count_nonzero(known)
         return float((np.count_nonzero(self.explained) - by_chance) / WINDOW_CELLS)
+
+    @property
+    def agreement(self) -> float:
+        """Fraction of the compared cells with structure that are not contradicted."""
+        compared = self.structured & np.isfinite(self.similarity)
+        count = np.count_nonzero(compared)
+        return float(np.count_nonzero(compared & ~self.contradicted) / count) if count else 0.0
+
+    @property
+    def correlation(self) -> float:
+        """Median correlation of the compared cells with structure; 0 without any."""
+        compared = self.similarity[self.structured & np.isfinite(self.similarity)]
+        return float(np.median(compared)) if len(compared) else 0.0
 
     @property
     def confirms(self) -> bool:
@@ -126,10 +149,9 @@ class Judge:
     @cached_property
     def _described(self) -> tuple[np.ndarray, np.ndarray]:
         """The principal axes, and the described cells of the first image, (rows, columns, D)."""
-        whole = _describe(self._first)
-        cells = whole.reshape(-1, whole.shape[2])
+        cells, shape = _describe(self._first)
         axes = np.linalg.eigh(cells.T @ cells)[1][:, -DIMENSIONS:]
-        return axes, whole @ axes
+        return axes, (cells @ axes).reshape(*shape, DIMENSIONS)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -192,7 +214,7 @@ class View:
     ) -> None:
         self._images, self._axes, self._first = images, axes, first
         self._pixels, self._shown, self._valid = valid.astype(np.uint8), shown, _at_cells(valid)
-        self._second = _describe(images[1]) @ axes
+        self._second = self._projected(images[1])
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -205,9 +227,16 @@ class View:
         ]
         chance = np.concatenate([each[np.isfinite(each)] for each in far])
         if len(chance) < WINDOW_CELLS:
-            return Evidence(np.full(self._valid.shape, np.nan), 1.0, 1.0)
+            nowhere = np.zeros(self._valid.shape, bool)
+            return Evidence(np.full(self._valid.shape, np.nan), 1.0, 1.0, nowhere, nowhere)
         bound = float(np.quantile(chance, 1 - FALSE_POSITIVE_RATE))
-        return Evidence(self._displaced(0, 0), bound, float(chance.std()))
+        own = self._displaced(0, 0)
+        around = [_mean_around(each) for each in (own, *far)]
+        with np.errstate(invalid="ignore"):
+            most = np.nanquantile(np.stack(around[1:]), 1 - CONTRADICTING_RATE)
+            contradicted = np.asarray(around[0] <= most)
+        structured = np.minimum(*map(_mean_gradient, self._images)) > MIN_GRADIENT
+        return Evidence(own, bound, float(chance.std()), contradicted, structured)
 
     @property
     def confirmed(self) -> bool:
@@ -221,7 +250,14 @@ class View:
         bound, spread = self.evidence.bound, self.evidence.spread
         everywhere = self._shown
         for shift in self._similar_shifts():
-            move = self._refined(shift)
+            move, field = self._refined(shift)
+            if np.abs(np.median(field, axis=(0, 1))).max() < MIN_PERIOD:
+                continue  # the refinement undid the shift
+            near = _gathered(self._first, self._second, self._valid, field)
+            with np.errstate(invalid="ignore"):
+                tied = self.evidence.explained & (own - near < 2 * spread)
+            if np.count_nonzero(tied) < MIN_TIED / 2 * np.count_nonzero(self.evidence.explained):
+                continue
             copy = self._moved(self._images[1], self._pixels, move)
             recurring = np.fmax(
                 *(
@@ -237,6 +273,8 @@ class View:
                 tied = np.count_nonzero(explained & ~(own - copy > spread))
             lost -= FALSE_POSITIVE_RATE * np.count_nonzero(known & ~explained)
             total = np.count_nonzero(explained)
+            if DEBUG:
+                print("        copy", shift, total, tied, np.count_nonzero(won), lost)
             if tied < MIN_TIED * total:
                 continue
             if np.count_nonzero(won) < max(MIN_WON * total, MIN_WON_RATIO * lost):
@@ -251,8 +289,12 @@ class View:
         how = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
         known = cv2.warpPerspective(valid, matrix, size, flags=nearest) > 0
-        cells = _describe(cv2.warpPerspective(image, matrix, size, **how)) @ self._axes
+        cells = self._projected(cv2.warpPerspective(image, matrix, size, **how))
         return _gathered(self._first, cells, _at_cells(known), np.zeros((*cells.shape[:2], 2)))
+
+    def _projected(self, image: np.ndarray) -> np.ndarray:
+        cells, shape = _describe(image)
+        return (cells @ self._axes).reshape(*shape, DIMENSIONS)
 
     def _displaced(self, x: int, y: int) -> np.ndarray:
         field = np.broadcast_to(np.float64([x, y]), (*self._valid.shape, 2))
@@ -280,8 +322,8 @@ class View:
         shifts = np.where(shifts > np.array(size) / 2, shifts - size, shifts)[:, ::-1]
         return shifts[np.abs(shifts).max(axis=1) >= MIN_PERIOD][:MAX_COPIES]
 
-    def _refined(self, shift: np.ndarray) -> np.ndarray:
-        """Return the homography, between positions in cells, of a copy near a shift.
+    def _refined(self, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the homography, between positions in cells, of a copy near a shift, and its field.
 
         In a tilted view, the periods of a pattern are not all alike: the best displacements nearby
         give a homography.
@@ -313,20 +355,20 @@ class View:
             near = np.where(np.isfinite(near), near, -1)
             good = near.max(axis=0) > self.evidence.bound
             if np.count_nonzero(good) < 2 * WINDOW_CELLS:
-                return result
+                return result, field
             starts = here[every, every][good]
             ends = starts + field[every, every][good] + np.array(around)[near.argmax(axis=0)[good]]
             try:
                 matrix, _ = cv2.findHomography(starts, ends, cv2.USAC_MAGSAC, 1.5)
             except cv2.error:  # for rare orders of the matches
-                return result
+                return result, field
             if matrix is None:
-                return result
+                return result, field
             mapped = cv2.perspectiveTransform(here.reshape(1, -1, 2), matrix).reshape(here.shape)
             if not np.abs(np.median(mapped - here - field, axis=(0, 1))).max() <= reach:
-                return result
+                return result, field
             field, result = mapped - here, matrix
-        return result
+        return result, field
 
 
 def _shown(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
@@ -342,8 +384,8 @@ def _at_cells(mask: np.ndarray) -> np.ndarray:
     return mask[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
 
 
-def _describe(gray: np.ndarray) -> np.ndarray:
-    """Return unit descriptors of all cells, (rows, columns, D) float32; 0 where nothing is."""
+def _describe(gray: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+    """Return unit descriptors of all cells, (N, D) float32, 0 where nothing is, and their shape."""
     height, width = gray.shape
     x, y = (np.arange(CELL_PX // 2, side, CELL_PX) for side in (width, height))
     pixels = np.dstack(np.meshgrid(x, y)).reshape(-1, 2)
@@ -356,7 +398,7 @@ def _describe(gray: np.ndarray) -> np.ndarray:
         part /= np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1e-6)
         part[~some] = 0
         parts.append(part / np.float32(np.sqrt(len(SIZES_PX))))
-    return np.hstack(parts).reshape(len(y), len(x), -1)
+    return np.hstack(parts), (len(y), len(x))
 
 
 def _gathered(
@@ -385,6 +427,23 @@ def _gathered(
         for each in (values, known.astype(np.float32))
     )
     return np.where(known & (count >= 5), total / np.maximum(count, 1), np.float32(np.nan))
+
+
+def _mean_gradient(gray: np.ndarray) -> np.ndarray:
+    """Return the mean difference of pixels two apart around each cell."""
+    side = 3 * round(WINDOW_CELLS**0.5) * CELL_PX // 2
+    return _at_cells(cv2.boxFilter(sift_gradient(gray)[0], -1, (side, side)))
+
+
+def _mean_around(values: np.ndarray) -> np.ndarray:
+    """Average each cell with those in the windows around its own; NaN stays NaN."""
+    side = 3 * round(WINDOW_CELLS**0.5)
+    known = np.isfinite(values)
+    total, count = (
+        cv2.boxFilter(each, cv2.CV_64F, (side, side), borderType=cv2.BORDER_CONSTANT)
+        for each in (np.where(known, values, 0), known.astype(np.float32))
+    )
+    return np.where(known, total / np.maximum(count, 1e-9), np.nan)
 
 
 def _predicted(

@@ -49,8 +49,8 @@ class RegisteredPair:
     """The numbers of two images, and the homography between them that dense keypoints confirm.
 
     `points`, (M, 2), are matched keypoints of the first image: all, or some if there are many.
-    `matches` is the number of all matches, `agreement` the fraction of the compared windows of both
-    images that the homography explains.
+    `matches` is the number of all matches, `explained` the fraction of what both images show in
+    common that the homography explains.
     """
 
     first: int
@@ -58,7 +58,7 @@ class RegisteredPair:
     homography: np.ndarray
     points: np.ndarray
     matches: int
-    agreement: float = 1.0
+    explained: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,9 +57,9 @@ MAX_DISAGREEMENT_PX = 2.0
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
-MIN_AGREEMENT = 0.5
-"""Two images contradict their homography if it explains less than this fraction of their windows:
-no more of one image is right than wrong."""
+MIN_EXPLAINED = 0.3
+"""Two images contradict their homography if it explains less than this fraction of what can be
+compared: screens whose menu stands still while the text scrolls reach 0.2."""
 
 MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
 """Images contradict each other if the RMS residual of their joint fit exceeds the inlier threshold
@@ -150,7 +150,7 @@ def register_images(
         raise RegistrationError(f"the images contradict each other: {hint}") from None
     worst = max(pairs, key=lambda pair: _disagreement_px(pair, to_common))
     off_px = _disagreement_px(worst, to_common)
-    unlike = [pair.agreement < MIN_AGREEMENT for pair in pairs]
+    unlike = [pair.explained < MIN_EXPLAINED for pair in pairs]
     if residual_px > MAX_RESIDUAL_PX or np.mean(unlike) > 0.5:  # a few wrong pairs are outvoted
         reason = (
             f"{names[worst.first]} and {names[worst.second]} contradict each other where they "
@@ -249,8 +249,7 @@ def _register(
         return None
     order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
     spread = points[order[:MAX_CORRESPONDENCES]]
-    share = view.evidence.share
-    return RegisteredPair(first, second, matrix, spread, len(points), share)
+    return RegisteredPair(first, second, matrix, spread, len(points), view.evidence.share)
 
 
 def _registered_again(
