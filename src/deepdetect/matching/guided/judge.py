@@ -273,8 +273,6 @@ class View:
                 tied = np.count_nonzero(explained & ~(own - copy > spread))
             lost -= FALSE_POSITIVE_RATE * np.count_nonzero(known & ~explained)
             total = np.count_nonzero(explained)
-            if DEBUG:
-                print("        copy", shift, total, tied, np.count_nonzero(won), lost)
             if tied < MIN_TIED * total:
                 continue
             if np.count_nonzero(won) < max(MIN_WON * total, MIN_WON_RATIO * lost):
