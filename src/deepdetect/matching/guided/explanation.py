@@ -97,7 +97,7 @@ class Explanation:
             if found is not None and (
                 fallback is None or found.hypothesis.log10_nfa < fallback.hypothesis.log10_nfa
             ):
-                fallback = found
+                fallback, self._sources.hinted = found, True
         if not layers:
             return [] if fallback is None else [fallback]
         free = np.ones(len(tentative.points0), bool)
@@ -138,12 +138,12 @@ class Explanation:
             if self._is_part(plane, epipolar):
                 part = plane
                 break
+            if not self._on_free(judge.along_plane(plane.matrix).evidence, free).confirms:
+                sparse.append(plane)
+                continue
             matrix = refined(pair, plane.matrix)
             view = judge.along_plane(matrix)
             evidence = self._on_free(view.evidence, free)
-            if not evidence.confirms:
-                sparse.append(plane)
-                continue
             if view.repeated:
                 refuted |= plane.inliers
                 continue

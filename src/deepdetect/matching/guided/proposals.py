@@ -109,7 +109,12 @@ class Hypothesis:
 
 
 class Sources:
-    """Tentative matches of a pair, each source asked only once, and only when it is wanted."""
+    """Tentative matches of a pair, each source asked only once, and only when it is wanted.
+
+    Attributes:
+        hinted: set it when a source has found a geometry that the images do not yet confirm. More
+            points of the same kind may then help, those of other kinds are left out.
+    """
 
     def __init__(
         self,
@@ -118,6 +123,7 @@ class Sources:
         keypoints: tuple[Keypoints, Keypoints] | None = None,
     ) -> None:
         self._pair, self._given, self._keypoints = pair, given, keypoints
+        self.hinted = False
 
     def __iter__(self) -> Iterator[Tentative]:
         if isinstance(self._given, Tentative):
@@ -128,9 +134,11 @@ class Sources:
         elif self._keypoints is not None:
             yield from self._of_points(self._keypoints)
         yield self.learned
-        yield self._cross_modal()
+        if not self.hinted:
+            yield self._cross_modal()
         yield self.dense
-        yield self._views()
+        if not self.hinted:
+            yield self._views()
 
     @cached_property
     def learned(self) -> Tentative:
