@@ -10,8 +10,8 @@ import numpy as np
 
 from ..._shared.errors import ImageError
 from ...features.keypoints import Keypoints, nearest_keypoints
+from ...features.matches import MAX_KEYPOINT_DISTANCE_PX, GuidedMatches, TwoViewGeometry
 from ...features.matches import Evidence as PublicEvidence
-from ...features.matches import GuidedMatches, TwoViewGeometry
 from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.transforms import transfer_errors
@@ -26,9 +26,10 @@ from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, prop
 MIN_MATCHED_FRACTION = 0.02
 """Dense matching has failed if it matches less than this fraction of the keypoints."""
 
-MIN_PLANE_RATIO = 0.67
+MOST = 2 / 3
 """A scene has depth if a homography explains less than this fraction of the matches that agree with
-a fundamental matrix."""
+a fundamental matrix. The confidence is "high" only if as many of all matches follow one geometry:
+the others lie on what moves differently."""
 
 MAX_SPARSE_LOG10_NFA = -12.0
 """Without dense matches, sparse ones are an answer if the log10 number of false alarms is below
@@ -179,7 +180,7 @@ class Explanation:
 
     def _mostly(self, some: np.ndarray, inliers: np.ndarray) -> bool:
         """Return whether a plane with some matches explains most of the other inliers, too."""
-        return np.count_nonzero(some) >= MIN_PLANE_RATIO * np.count_nonzero(inliers)
+        return np.count_nonzero(some) >= MOST * np.count_nonzero(inliers)
 
     def _is_deep(self, pair: ImagePair, plane: Hypothesis, epipolar: Hypothesis) -> bool:
         """Return whether a scene has depth that a plane does not explain."""
@@ -220,7 +221,7 @@ class Explanation:
     def _sparse(self, hypothesis: Hypothesis) -> Layer | None:
         points0, points1 = hypothesis.points
         rows, distances = nearest_keypoints(points0, self.pixels[0], self._pair.sizes[0])
-        rows = np.where(np.isfinite(distances), rows, -1).astype(np.int64)
+        rows = np.where(distances <= MAX_KEYPOINT_DISTANCE_PX, rows, -1).astype(np.int64)
         scores = np.ones(len(rows), np.float32)
         matches = GuidedMatches(rows, points1, scores, subpixel=True, points0=points0)
         nowhere = np.zeros((1, 1), bool)
@@ -260,6 +261,7 @@ class Explanation:
                 alike |= layer.evidence.explained[cells]
         high = first.dense and first.evidence.share >= HIGH_SHARE
         high = high and own.log10_nfa < HIGH_LOG10_NFA
+        high = high and len(first.matches) >= MOST * len(matches)
         evidence = PublicEvidence(
             len(own.tentative.points0),
             int(np.count_nonzero(own.inliers)),
