@@ -1,7 +1,7 @@
 """Dense matches of a scene with depth, by rectification: epipolar lines become rows.
 
 Corresponding rows are matched (`matching.stereo`) over a range of disparities that sparse matches
-and a small copy of the pair give. Each match ends at a sub-pixel position, not at a keypoint.
+give. Each match ends at a sub-pixel position, not at a keypoint.
 
 A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
 are tracked from one view to the other, starting from the matches of the rows, and the matrix is
@@ -35,7 +35,6 @@ from ...geometry.transforms import (
 from ..stereo.matching import (
     DisparityOptions,
     compute_disparity,
-    find_disparity_range,
     range_with_margin,
 )
 from ..stereo.sgm import DisparityRange
@@ -201,13 +200,6 @@ def rectified_view(
         plane = None if plane is None else scaled_homography(plane, scale, scale)
         return rectified_view((small0, small1), (points0, points1), fundamental, plane, scale)
     (first, valid0), (second, valid1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
-    # A small copy of a polar frame also gives disparities of the wrong sign, so it is not searched.
-    seen = None if isinstance(frame, PolarFrame) else find_disparity_range(first, second)
-    if seen is not None:
-        widened = min(low, seen[0]), max(high, seen[1])
-        # The range of the small copy may be far off, so it must be searchable at this image size.
-        if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
-            low, high = widened
     widest = frame.size[0] - 1
     searched = max(low, -widest), min(high, widest)
     if searched[0] >= searched[1]:
