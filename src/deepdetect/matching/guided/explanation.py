@@ -197,18 +197,24 @@ class Explanation:
         free: np.ndarray | None,
     ) -> Layer | None:
         """Match along epipolar lines, also in images that a plane makes alike; None if rejected."""
+        count, lattice = len(self.pixels[0]), judge.lattice()
+        everywhere = np.concatenate([self.pixels[0], lattice])
         for plane in dict.fromkeys(planes):
-            matrix = None if plane is None else plane.matrix
-            dense = match_by_rectification(
-                pair.grays, self.pixels[0], epipolar.points, epipolar.matrix, plane=matrix
+            known = None if plane is None else plane.matrix
+            found = match_by_rectification(
+                pair.grays, everywhere, epipolar.points, epipolar.matrix, plane=known
             )
-            if dense is not None and len(dense[1]) >= self._enough:
+            if found is not None and np.count_nonzero(found[1].indices0 < count) >= self._enough:
                 break
         else:
             return None
-        matrix, matches = dense
+        matrix, both = found
+        own = both.indices0 < count
+        columns = both.indices0, both.points1, both.scores
+        matches = GuidedMatches(*(each[own] for each in columns), subpixel=True)
         starts = matches.starts(self.pixels[0])
-        view = judge.along_matches(starts, matches.points1)
+        # The lattice is judged, so that the answer does not depend on where keypoints are.
+        view = judge.along_matches(everywhere[both.indices0[~own]], both.points1[~own])
         evidence = self._on_free(view.evidence, free)
         if not evidence.confirms or view.repeated:
             return None

@@ -167,6 +167,13 @@ class Judge:
         )
         return row, column
 
+    def lattice(self) -> np.ndarray:
+        """Return (N, 2) float32 positions on whole pixels of the first image, two cells apart."""
+        rows, columns = self.shape
+        x, y = (CELL_PX * (np.arange(0, count, 2) + 0.5) for count in (columns, rows))
+        points = np.dstack(np.meshgrid(x, y)).reshape(-1, 2) / self._scales[0]
+        return np.rint(points).astype(np.float32)
+
     def along_plane(self, homography: np.ndarray) -> View:
         """Return the second image as a homography places it in the frame of the first."""
         matrix, size = scaled_homography(homography, *self._scales), self._first.shape[::-1]
