@@ -70,7 +70,7 @@ def within(found: GuidedMatches, xy0: np.ndarray, cones, move: np.ndarray) -> fl
 @pytest.mark.parametrize(
     ("move", "precision"),
     [
-        (None, 0.93),
+        (None, 0.97),
         (TURNED, 0.93),
         (np.float64([[0.8, 0, 30], [0, 0.8, 20]]), 0.85),
     ],
@@ -88,19 +88,6 @@ def test_most_keypoints_are_matched_and_right(cones, found, move, precision: flo
     assert within(found, xy0, cones, move) > precision
     assert ((found.scores >= 0) & (found.scores <= 1)).all()
     assert (np.diff(found.indices0) > 0).all()
-
-
-def test_low_correlation_is_kept_where_little_is_found_by_chance(
-    cones, first, found, monkeypatch
-) -> None:
-    """Smooth surfaces: what is kept beyond the bounds is right nearly as often."""
-    left, right, _ = cones
-    xy0 = every_second(left)
-    monkeypatch.setattr(along_rows, "FALSE_DISCOVERY_RATE", 0.0)
-    strict = match(left, right, xy0, first)
-    assert set(strict.indices0) < set(found.indices0)
-    assert len(found) > 1.05 * len(strict)
-    assert within(found, xy0, cones, np.eye(2, 3)) > 0.97
 
 
 def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(

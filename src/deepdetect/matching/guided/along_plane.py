@@ -43,10 +43,10 @@ def match_along_plane(
     indices1, distances = nearest_keypoints(predicted, pixels[1], pair.sizes[1])
     indices0 = np.flatnonzero(distances < MAX_DISTANCE_PX)
     cells = judge.cells_of(pixels[0][indices0])
-    kept = evidence.explained[cells]
+    kept = evidence.believed[cells]
     indices0 = indices0[kept]
     indices1 = indices1[indices0]
-    scores = evidence.similarity[cells][kept].astype(np.float32)
+    scores = np.nan_to_num(evidence.similarity[cells][kept], nan=evidence.bound).astype(np.float32)
     ends = pixels[1][indices1].astype(np.float64)
     return GuidedMatches(indices0, ends, scores.clip(0, 1), indices1=indices1)
 

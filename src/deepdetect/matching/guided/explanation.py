@@ -38,6 +38,10 @@ this."""
 OFF_RATIO = 4.0
 """Tentative matches with errors above this multiple of the inlier threshold are not explained."""
 
+MIN_GAIN = 1.05
+"""A plane moves on its own if a fundamental matrix of the rest alone fits this many times as many
+matches of the rest as the matrix of all, and less than a third of those on the plane."""
+
 MAX_LAYERS = 4
 """Maximum number of geometries of one pair: one of the scene, others of what moves on its own."""
 
@@ -137,6 +141,10 @@ class Explanation:
         for plane in planes(pair, tentative, self._seed) if self._asked != "fundamental" else ():
             self.best_nfa = min(self.best_nfa, plane.log10_nfa)
             if self._is_part(plane, epipolar):
+                view = judge.along_plane(plane.matrix)
+                if self._on_free(view.evidence, free).confirms and view.repeated:
+                    refuted |= plane.inliers
+                    continue
                 part = plane
                 break
             if not self._on_free(judge.along_plane(plane.matrix).evidence, free).confirms:
@@ -155,6 +163,9 @@ class Explanation:
             break
         if epipolar is not None and self._mostly(refuted, epipolar.inliers):
             epipolar = None  # it explains the same pattern
+        plane = part if flat is None else flat.hypothesis
+        if epipolar is not None and plane is not None:
+            epipolar = self._apart(pair, plane, epipolar)
         if epipolar is not None:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
             deep = flat is None or self._is_deep(pair, flat.hypothesis, epipolar)
@@ -173,6 +184,20 @@ class Explanation:
             layer = self._sparse(best)
             if layer is not None:
                 yield layer
+
+    def _apart(self, pair: ImagePair, plane: Hypothesis, epipolar: Hypothesis) -> Hypothesis:
+        """Return the geometry of what is off a plane, if the plane moves on its own."""
+        ends = plane.tentative.points0, plane.tentative.points1
+        off = plane.errors(*ends) > OFF_RATIO / 2 * plane.threshold_px
+        rest = propose(pair, plane.tentative.chosen(off), "fundamental", self._seed)
+        if rest is None:
+            return epipolar
+        inliers = np.zeros(len(off), bool)
+        inliers[np.flatnonzero(off)[rest.inliers]] = True
+        rest = replace(rest, inliers=inliers, tentative=plane.tentative)
+        along = rest.errors(*plane.points) < 2 * rest.threshold_px
+        gain = np.count_nonzero(inliers) > MIN_GAIN * np.count_nonzero(epipolar.inliers & off)
+        return rest if gain and along.mean() < 1 / 3 else epipolar
 
     def _is_part(self, plane: Hypothesis, epipolar: Hypothesis | None) -> bool:
         """Return whether a plane is only a part of a scene with depth."""

@@ -14,6 +14,7 @@ next period may just be hidden.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,11 +22,17 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...features.sift import dense_sift, sift_gradient, to_root_sift
-from ...geometry.transforms import scaled_homography, scaled_points, translation_matrix
+from ...geometry.transforms import (
+    scaled_homography,
+    scaled_points,
+    scaling_matrix,
+    translation_matrix,
+)
 from .image_pair import ImagePair, Pair
 
 SIDE_PX = 480
-"""Images are reduced to this longer side before they are compared."""
+"""Images are scaled to this longer side before they are compared, so that cells have one size in
+relation to what they show."""
 
 CELL_PX, SIZES_PX = 4, (3.0, 6.0)
 """Distance of the cells in pixels, and diameters of the keypoints that describe them. A descriptor
@@ -55,8 +62,9 @@ MIN_WON, MIN_WON_RATIO = 0.025, 2.0
 and the second value times as many as the copy explains better. On facades with one window that is
 unlike the others, the fraction is 0.032 or more; if all are alike, 0.019 or less for some copy."""
 
-MIN_GRADIENT = 4.0
-"""Mean difference, in grey levels, of pixels two apart, above which a place shows more than noise.
+MIN_STRUCTURE, MIN_GRADIENT = 0.5, 4.0
+"""Mean difference, in grey levels, of pixels two apart: what has less than the first value in both
+images is flat and not compared; what has more than the second in both shows more than noise.
 Noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
 
 MIN_TIED = 0.5
@@ -72,11 +80,9 @@ of what can be compared. Geometries of unrelated photographs explain up to 0.07.
 MIN_WINDOWS_AROUND = 5
 """The place of a window is predicted if this many of the eight windows around it hold matches."""
 
-HIDDEN_MARGIN_PX = 9
-"""Cells closer than this to what is left out are not compared: half the reach of a descriptor."""
-
-CHECKED_MARGIN_PX = 2
-"""Cells closer than this to the border of the second image are not compared."""
+MARGIN_PX = 9
+"""Cells closer than this to the border of an image, or to what is left out, are not compared: half
+the reach of a descriptor. That two images end at the same place is no evidence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +109,13 @@ class Evidence:
         """(rows, columns) bool, where the geometry explains the image."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.similarity > self.bound)
+
+    @cached_property
+    def believed(self) -> np.ndarray:
+        """(rows, columns) bool, where matches are believed: at the border, as next to it."""
+        side = 2 * (MARGIN_PX // CELL_PX + 1) + 1
+        near = cv2.dilate(self.explained.astype(np.uint8), np.ones((side, side))) > 0
+        return np.where(np.isfinite(self.similarity), self.explained, near)
 
     @property
     def windows(self) -> float:
@@ -140,7 +153,10 @@ class Judge:
     """Judges geometries of one pair of images."""
 
     def __init__(self, pair: ImagePair) -> None:
-        (self._first, self._second), self._scales = pair.both(SIDE_PX)
+        (self._first, scale0), (self._second, scale1) = (
+            _enlarged(*pair.reduced(side, SIDE_PX)) for side in (0, 1)
+        )
+        self._scales = scale0, scale1
         self._shown = [
             _shown(mask, gray.shape)
             for mask, gray in zip(pair.masks, (self._first, self._second), strict=True)
@@ -201,9 +217,8 @@ class Judge:
         return self._view(warped, known)
 
     def _view(self, warped: np.ndarray, valid: np.ndarray) -> View:
-        margin = 2 * CHECKED_MARGIN_PX + 1
-        valid = cv2.erode(valid.astype(np.uint8), np.ones((margin, margin)), borderValue=0) > 0
-        valid &= self._shown[0] > 0
+        gradients = [_mean_gradient(gray) for gray in (self._first, warped)]
+        valid &= (self._shown[0] > 0) & (np.maximum(*gradients) > MIN_STRUCTURE)
         axes, cells = self._described
         return View((self._first, warped), axes, cells, valid, self._shown[0])
 
@@ -236,13 +251,18 @@ class View:
         if len(chance) < WINDOW_CELLS:
             nowhere = np.zeros(self._valid.shape, bool)
             return Evidence(np.full(self._valid.shape, np.nan), 1.0, 1.0, nowhere, nowhere)
-        bound = float(np.quantile(chance, 1 - FALSE_POSITIVE_RATE))
+        # Copies that happen to be displaced by the period of a pattern are outvoted.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # copies that show nothing
+            bounds = [np.nanquantile(each, 1 - FALSE_POSITIVE_RATE) for each in far]
+        bound = float(np.nanmedian(bounds))
         own = self._displaced(0, 0)
         around = [_mean_around(each) for each in (own, *far)]
         with np.errstate(invalid="ignore"):
             most = np.nanquantile(np.stack(around[1:]), 1 - CONTRADICTING_RATE)
             contradicted = np.asarray(around[0] <= most)
-        structured = np.minimum(*map(_mean_gradient, self._images)) > MIN_GRADIENT
+        gradients = [_at_cells(_mean_gradient(gray)) for gray in self._images]
+        structured = np.minimum(*gradients) > MIN_GRADIENT
         return Evidence(own, bound, float(chance.std()), contradicted, structured)
 
     @property
@@ -376,12 +396,24 @@ class View:
         return result, field
 
 
+def _enlarged(gray: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
+    """Enlarge an image whose longer side is below `SIDE_PX`; return it and its new scale."""
+    factor = SIDE_PX / max(gray.shape)
+    if factor <= 1:
+        return gray, scale
+    size = round(gray.shape[1] * factor), round(gray.shape[0] * factor)
+    matrix, how = scaling_matrix(factor)[:2], {"flags": cv2.INTER_CUBIC}
+    enlarged = cv2.warpAffine(gray, matrix, size, borderMode=cv2.BORDER_REPLICATE, **how)
+    return enlarged, scale * factor
+
+
 def _shown(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     """Return where an image of a shape is not left out, (H, W) uint8."""
     if mask is None:
-        return np.ones(shape, np.uint8)
+        mask = np.zeros(shape, bool)
     left = cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
-    return 1 - cv2.dilate(left, np.ones((2 * HIDDEN_MARGIN_PX + 1,) * 2))
+    side = 2 * MARGIN_PX + 1
+    return cv2.erode(1 - left, np.ones((side, side)), borderValue=0)
 
 
 def _at_cells(mask: np.ndarray) -> np.ndarray:
@@ -435,9 +467,9 @@ def _gathered(
 
 
 def _mean_gradient(gray: np.ndarray) -> np.ndarray:
-    """Return the mean difference of pixels two apart around each cell."""
+    """Return the mean difference of pixels two apart around each pixel."""
     side = 3 * round(WINDOW_CELLS**0.5) * CELL_PX // 2
-    return _at_cells(cv2.boxFilter(sift_gradient(gray)[0], -1, (side, side)))
+    return cv2.boxFilter(sift_gradient(gray)[0], -1, (side, side))
 
 
 def _mean_around(values: np.ndarray) -> np.ndarray:

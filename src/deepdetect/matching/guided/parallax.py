@@ -36,9 +36,12 @@ SAMPLES, MAX_ANGLE = 1000, 0.25
 """Epipoles that are tried, and angle in radians between a displacement and its line that still
 agree: a third of the error of tracks for each pixel."""
 
-MIN_ALIGNED, MIN_SHARE = 0.75, 0.08
+MIN_ALIGNED, MIN_SHARE, MIN_FAR_SHARE = 0.8, 0.08, 0.02
 """A scene has depth if at least the first fraction of the places off the plane agrees with an
-epipole, and the second fraction of all places. By chance, .16 of the places off a plane agree."""
+epipole, and of all places the second fraction is off the plane and agrees, or the third is so by
+more than `FAR` times the noise, as a post before a wall. By chance, .16 of the places agree."""
+
+FAR = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +51,21 @@ class Parallax:
     Attributes:
         aligned: fraction of the places off the plane that agree with the best epipole.
         share: fraction of all places that are off the plane and agree with it.
+        far_share: fraction of all places that do so and are clearly off the plane.
         points0, points1: (N, 2) places in both images, to a fraction of a pixel.
     """
 
     aligned: float
     share: float
+    far_share: float
     points0: np.ndarray
     points1: np.ndarray
 
     @property
     def shows_depth(self) -> bool:
         """Whether the scene has depth."""
-        return self.aligned >= MIN_ALIGNED and self.share >= MIN_SHARE
+        many = self.share >= MIN_SHARE or self.far_share >= MIN_FAR_SHARE
+        return self.aligned >= MIN_ALIGNED and many
 
 
 def measure_parallax(
@@ -82,7 +88,7 @@ def measure_parallax(
         for both in ((starts, matched[near]), (starts, ends[near]))
     )
     if not len(starts):
-        return Parallax(0.0, 0.0, np.empty((0, 2)), np.empty((0, 2)))
+        return Parallax(0.0, 0.0, 0.0, np.empty((0, 2)), np.empty((0, 2)))
     tracked, gaps = track_round_trip(
         equalised, equalise(warped), starts, WINDOW_PX, levels=1, expected=expected
     )
@@ -96,13 +102,14 @@ def measure_parallax(
     points = scaled_points(starts, 1 / scale0), transform_points(tracked, matrix)
     points = points[0], scaled_points(points[1], 1 / scale1)
     if np.count_nonzero(off) < 3:
-        return Parallax(0.0, 0.0, *points)
+        return Parallax(0.0, 0.0, 0.0, *points)
     agreeing = _agreeing(starts[off], moved[off] / length[off, None], max(first.shape), seed)
-    return Parallax(agreeing / np.count_nonzero(off), agreeing / len(off), *points)
+    far = np.count_nonzero(agreeing & (length[off] > FAR * NOISE_PX)) / len(off)
+    return Parallax(agreeing.mean(), agreeing.sum() / len(off), far, *points)
 
 
-def _agreeing(places: np.ndarray, directions: np.ndarray, side: int, seed: int) -> int:
-    """Return how many of (N, 2) directions agree with the epipole with which most agree."""
+def _agreeing(places: np.ndarray, directions: np.ndarray, side: int, seed: int) -> np.ndarray:
+    """Return which of (N, 2) directions agree with the epipole with which most agree, (N,) bool."""
     places = np.column_stack([places / side - 0.5, np.ones(len(places))])
     lines = np.cross(places, np.column_stack([directions, np.zeros(len(directions))]))
     chosen = np.random.default_rng(seed).integers(0, len(lines), (SAMPLES, 2))
@@ -110,8 +117,9 @@ def _agreeing(places: np.ndarray, directions: np.ndarray, side: int, seed: int) 
     length = np.linalg.norm(epipoles, axis=1)
     epipoles = epipoles[length > 1e-3] / length[length > 1e-3, None]
     if not len(epipoles):
-        return 0
+        return np.zeros(len(places), bool)
     towards = epipoles[:, None, :2] - epipoles[:, None, 2:] * places[None, :, :2]
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)
     across = np.abs(towards[..., 0] * directions[:, 1] - towards[..., 1] * directions[:, 0])
-    return int(np.count_nonzero(across < MAX_ANGLE, axis=1).max())
+    agreeing = across < MAX_ANGLE
+    return np.asarray(agreeing[np.argmax(np.count_nonzero(agreeing, axis=1))])

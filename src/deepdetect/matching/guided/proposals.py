@@ -48,7 +48,8 @@ MIN_MATCHES = 8
 """Fewer matches are no evidence for a geometry."""
 
 SEMI_CALIBRATED_MATCHES = 200
-"""With fewer matches on its lines, a fundamental matrix is also estimated with ordinary cameras."""
+"""With fewer matches on its lines, a fundamental matrix is also estimated with ordinary cameras. Not
+for simulated views, which see one place so often that their matches are not independent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +292,7 @@ def propose(pair: ImagePair, tentative: Tentative, model: str, seed: int) -> Hyp
     threshold_px = GUIDING_THRESHOLDS_PX[model] * tentative.pixel
     found = fit_model(*ends, model, size, threshold_px, seed)
     few = np.count_nonzero(found.inliers) < SEMI_CALIBRATED_MATCHES
-    if model == "fundamental" and few:
+    if model == "fundamental" and few and not tentative.views:
         known = estimate_semi_calibrated(*ends, pair.sizes, threshold_px, seed)
         if known is not None and known.log10_nfa < found.log10_nfa:
             found = known
