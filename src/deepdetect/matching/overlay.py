@@ -30,7 +30,7 @@ WINDOW_PX, MAX_DIFFERENCE, MIN_GRADIENTS = 7, 0.3, 32.0
 gradients is below the second value times the sum of both, and this sum is above the third: 2 grey
 levels per pixel in each image, as Sobel's filter scales them."""
 
-MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 0.75, 3.0, 8
+MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
 """A match stands still if it moves by less than the first value, about the error of a keypoint. The
 scene clearly moves at a place if this number of its nearest moving matches move by more than the
 second. At the end of a street, which hardly moves for a camera that drives along it, few do."""

@@ -31,6 +31,10 @@ MOST = 2 / 3
 a fundamental matrix. The confidence is "high" only if as many of all matches follow one geometry:
 the others lie on what moves differently."""
 
+NEARLY_ALL = 0.9
+"""A plane that explains this fraction of what both images show may explain only half of the
+matches: those from one period of a pattern to another lie on epipolar lines, too."""
+
 MAX_SPARSE_LOG10_NFA = -12.0
 """Without dense matches, sparse ones are an answer if the log10 number of false alarms is below
 this."""
@@ -118,7 +122,7 @@ class Explanation:
                 break
             layers.append(further)
             explained = explained | further.evidence.explained
-        return layers
+        return sorted(layers, key=lambda layer: -layer.evidence.windows)
 
     def _seen(self, cross_modal: bool) -> tuple[ImagePair, Judge]:
         if cross_modal not in self._judges:
@@ -138,34 +142,34 @@ class Explanation:
         flat: Layer | None = None
         part: Hypothesis | None = None
         sparse: list[Hypothesis] = []
-        for plane in planes(pair, tentative, self._seed) if self._asked != "fundamental" else ():
+        flats: list[Hypothesis] = []
+        if self._asked != "fundamental":
+            flats = [*planes(pair, tentative, self._seed)]
+        for plane in flats:
             self.best_nfa = min(self.best_nfa, plane.log10_nfa)
-            if self._is_part(plane, epipolar):
-                view = judge.along_plane(plane.matrix)
-                if self._on_free(view.evidence, free).confirms and view.repeated:
-                    refuted |= plane.inliers
-                    continue
-                part = plane
-                break
-            if not self._on_free(judge.along_plane(plane.matrix).evidence, free).confirms:
+            view = judge.along_plane(plane.matrix)
+            evidence = self._on_free(view.evidence, free)
+            if not evidence.confirms:
                 sparse.append(plane)
                 continue
-            matrix = refined(pair, plane.matrix)
-            view = judge.along_plane(matrix)
-            evidence = self._on_free(view.evidence, free)
             if view.repeated:
                 refuted |= plane.inliers
                 continue
+            least = 1 / 2 if evidence.share >= NEARLY_ALL else MOST
+            if epipolar is not None and not _mostly(plane.inliers, epipolar.inliers, least):
+                part = plane
+                break
+            matrix = refined(pair, plane.matrix)
+            evidence = self._on_free(judge.along_plane(matrix).evidence, free)
             plane = replace(plane, matrix=matrix)
             matches = match_along_plane(pair, self.pixels, matrix, judge, evidence)
             if len(matches) >= self._enough:
                 flat = Layer(plane, matches, evidence)
             break
-        if epipolar is not None and self._mostly(refuted, epipolar.inliers):
+        if epipolar is not None and _mostly(refuted, epipolar.inliers):
             epipolar = None  # it explains the same pattern
-        plane = part if flat is None else flat.hypothesis
-        if epipolar is not None and plane is not None:
-            epipolar = self._apart(pair, plane, epipolar)
+        if epipolar is not None:
+            epipolar = self._apart(pair, flats, epipolar)
         if epipolar is not None:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
             deep = flat is None or self._is_deep(pair, flat.hypothesis, epipolar)
@@ -185,27 +189,23 @@ class Explanation:
             if layer is not None:
                 yield layer
 
-    def _apart(self, pair: ImagePair, plane: Hypothesis, epipolar: Hypothesis) -> Hypothesis:
-        """Return the geometry of what is off a plane, if the plane moves on its own."""
-        ends = plane.tentative.points0, plane.tentative.points1
-        off = plane.errors(*ends) > OFF_RATIO / 2 * plane.threshold_px
-        rest = propose(pair, plane.tentative.chosen(off), "fundamental", self._seed)
-        if rest is None:
-            return epipolar
-        inliers = np.zeros(len(off), bool)
-        inliers[np.flatnonzero(off)[rest.inliers]] = True
-        rest = replace(rest, inliers=inliers, tentative=plane.tentative)
-        along = rest.errors(*plane.points) < 2 * rest.threshold_px
-        gain = np.count_nonzero(inliers) > MIN_GAIN * np.count_nonzero(epipolar.inliers & off)
-        return rest if gain and along.mean() < 1 / 3 else epipolar
-
-    def _is_part(self, plane: Hypothesis, epipolar: Hypothesis | None) -> bool:
-        """Return whether a plane is only a part of a scene with depth."""
-        return epipolar is not None and not self._mostly(plane.inliers, epipolar.inliers)
-
-    def _mostly(self, some: np.ndarray, inliers: np.ndarray) -> bool:
-        """Return whether a plane with some matches explains most of the other inliers, too."""
-        return np.count_nonzero(some) >= MOST * np.count_nonzero(inliers)
+    def _apart(
+        self, pair: ImagePair, flats: Sequence[Hypothesis], epipolar: Hypothesis
+    ) -> Hypothesis:
+        """Return the geometry of what is off a plane, if a plane moves on its own."""
+        for plane in flats:
+            tentative = plane.tentative
+            off = plane.errors(tentative.points0, tentative.points1) > 2 * plane.threshold_px
+            rest = propose(pair, tentative.chosen(off), "fundamental", self._seed)
+            if rest is None:
+                continue
+            inliers = np.zeros(len(off), bool)
+            inliers[np.flatnonzero(off)[rest.inliers]] = True
+            along = rest.errors(*plane.points) < 2 * rest.threshold_px
+            gain = np.count_nonzero(inliers) > MIN_GAIN * np.count_nonzero(epipolar.inliers & off)
+            if gain and np.mean(along) < 1 / 3:
+                return replace(rest, inliers=inliers, tentative=tentative)
+        return epipolar
 
     def _is_deep(self, pair: ImagePair, plane: Hypothesis, epipolar: Hypothesis) -> bool:
         """Return whether a scene has depth that a plane does not explain."""
@@ -343,3 +343,8 @@ def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
             "the lens of both images bends straight lines, as that of a fisheye, which no "
             f"pinhole geometry fits: {UNDISTORT}"
         )
+
+
+def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
+    """Return whether `some` matches are as many as a fraction of other `inliers`."""
+    return bool(np.count_nonzero(some) >= least * np.count_nonzero(inliers))

@@ -48,8 +48,8 @@ MIN_MATCHES = 8
 """Fewer matches are no evidence for a geometry."""
 
 SEMI_CALIBRATED_MATCHES = 200
-"""With fewer matches on its lines, a fundamental matrix is also estimated with ordinary cameras. Not
-for simulated views, which see one place so often that their matches are not independent."""
+"""With fewer matches on its lines, a fundamental matrix is also estimated with ordinary cameras, but
+not of simulated views: they see one place often, so their matches are not independent."""
 
 
 @dataclass(frozen=True, eq=False)
