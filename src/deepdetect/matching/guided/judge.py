@@ -34,7 +34,7 @@ SIDE_PX = 480
 """Images are scaled to this longer side before they are compared, so that cells have one size in
 relation to what they show."""
 
-CELL_PX, SIZES_PX = 4, (3.0, 6.0)
+CELL_PX, SIZES_PX = 4, (2.5, 4.5)
 """Distance of the cells in pixels, and diameters of the keypoints that describe them. A descriptor
 covers a square of six diameters."""
 
