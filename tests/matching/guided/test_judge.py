@@ -53,7 +53,7 @@ def test_cells_are_explained_where_the_second_image_shows_them(warped_pair: Imag
     clear = ((places > 12) & (places < 243)).all(axis=1)
     outside = ((places < 0) | (places > 255)).any(axis=1)
     rows, columns = judge.cells_of(points)
-    assert evidence.explained[rows, columns][clear].mean() > 0.98
+    assert evidence.believed[rows, columns][clear].mean() > 0.98
     assert not evidence.explained[rows, columns][outside].any()
 
 
