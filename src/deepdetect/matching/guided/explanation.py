@@ -33,7 +33,7 @@ the others lie on what moves differently."""
 
 NEARLY_ALL = 0.9
 """A plane that explains this fraction of what both images show may explain only half of the
-matches: those from one period of a pattern to another lie on epipolar lines, too."""
+matches, because those from one period of a pattern to another also lie on epipolar lines."""
 
 MAX_SPARSE_LOG10_NFA = -12.0
 """Without dense matches, sparse ones are an answer if the log10 number of false alarms is below
@@ -54,7 +54,8 @@ HIGH_SHARE, HIGH_LOG10_NFA = 0.2, -12.0
 windows, and the log10 number of false alarms is below the second value."""
 
 SCENE_MATCHES, DOMINANT_FRACTION = 1000, 0.5
-"""A plane is dominant if at least this fraction of so many random dense matches lies on it."""
+"""A plane is dominant if DOMINANT_FRACTION of SCENE_MATCHES random dense matches or more lie on it,
+which makes it the largest part of the scene."""
 
 
 @dataclass(frozen=True, eq=False)

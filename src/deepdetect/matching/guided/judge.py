@@ -31,58 +31,65 @@ from ...geometry.transforms import (
 from .image_pair import ImagePair, Pair
 
 SIDE_PX = 480
-"""Images are scaled to this longer side before they are compared, so that cells have one size in
-relation to what they show."""
+"""Images are scaled to this longer side before they are compared, so that cells have one size
+relative to the image. A homography that is off by 3 pixels at 640 still aligns them."""
 
 CELL_PX, SIZES_PX = 4, (2.5, 4.5)
-"""Distance of the cells in pixels, and diameters of the keypoints that describe them. A descriptor
-covers a square of six diameters."""
+"""Cells are this many pixels apart and described by keypoints of these diameters, whose descriptors
+cover six times as much. With 3 and 6, edges of small planes are less sharp; with less, darkness
+and fog leave fewer cells."""
 
 DIMENSIONS = 64
-"""Descriptors are reduced to this number of principal components of the first image."""
+"""Descriptors are reduced to this number of principal components of the first image, which changes
+correlations by less than noise and takes a quarter of the time."""
 
 FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
-"""Fractions of the cells of displaced copies that pass for explained, and whose surroundings do not
-pass for contradicted: a single cell needs more evidence than a doubt needs against many."""
+"""A cell is explained if fewer than the first fraction of the cells of displaced copies correlate
+as well. It is contradicted if its surroundings do not pass the second: doubting one cell
+needs less evidence than believing it."""
 
 FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
-"""Displacements of the copies that show what chance looks like, as fractions of width and height.
-Each is also used in the opposite direction."""
+"""Copies displaced by these fractions of width and height, in both directions, show what chance
+looks like on this pair."""
 
 MIN_PERIOD = 3
-"""Smaller displacements, in cells, are not copies: aligned images correlate there."""
+"""Displacements of fewer cells are no copies, because descriptors of aligned images overlap."""
 
-MIN_SIMILARITY, MAX_COPIES, MIN_OVERLAP = 0.4, 6, 0.5
-"""Displaced copies are compared with a geometry if their correlation over the whole image is at
-least the first fraction of its own; at most so many, the best ones; if this fraction of the overlap
-remains. Planes of Oxford have copies of up to 0.3, facades of one repeated window 0.6 or more."""
+MIN_SIMILARITY, MAX_COPIES, MIN_OVERLAP = 0.4, 4, 0.5
+"""A displaced copy is compared with a geometry if its correlation over the whole image is at least
+the first fraction of the geometry's, and this fraction of the overlap remains. Planes of Oxford
+have copies of up to 0.3, facades of one repeated window 0.6 or more. A lattice has four nearest
+copies."""
 
 MIN_WON, MIN_WON_RATIO = 0.025, 2.0
-"""A geometry must explain at least the first fraction of the cells clearly better than a copy does,
+"""A geometry must explain at least the first fraction of its cells clearly better than a copy does,
 and the second value times as many as the copy explains better. On facades with one window that is
 unlike the others, the fraction is 0.032 or more; if all are alike, 0.019 or less for some copy."""
 
-MIN_STRUCTURE, MIN_GRADIENT = 0.5, 4.0
-"""Mean difference, in grey levels, of pixels two apart: what has less than the first value in both
-images is flat and not compared; what has more than the second in both shows more than noise.
-Noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
-
 MIN_TIED = 0.5
-"""A copy competes with a geometry if it explains at least this fraction of its cells as well."""
+"""A copy competes with a geometry if it explains at least this fraction of its cells as well. One
+that explains only the road of a street competes with nothing."""
+
+MIN_STRUCTURE, MIN_GRADIENT = 0.5, 4.0
+"""What has a mean difference of pixels two apart, in grey levels, below the first value in both
+images is flat and not compared. What has more than the second value in both shows more than noise:
+noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
 
 WINDOW_CELLS = 16
-"""Cells in a window of 16 pixels: the unit in which explained parts of the image are counted."""
+"""Cells in a window of 16 pixels, the unit in which explained parts of the image are counted,
+because adjacent cells share most of their pixels."""
 
 MIN_WINDOWS, MIN_SHARE = 8.0, 0.1
 """The images confirm a geometry if it explains at least this number of windows, and this fraction
-of what can be compared. Geometries of unrelated photographs explain up to 0.07."""
+of what can be compared. Geometries of unrelated photographs explain up to 0.07 of them, correct
+ones of long strips in other light 8 windows or more."""
 
 MIN_WINDOWS_AROUND = 5
-"""The place of a window is predicted if this many of the eight windows around it hold matches."""
+"""The place of a window is predicted if most of the eight windows around it hold matches."""
 
 MARGIN_PX = 9
-"""Cells closer than this to the border of an image, or to what is left out, are not compared: half
-the reach of a descriptor. That two images end at the same place is no evidence."""
+"""Cells closer than this to the border of an image, or to what is left out, are not compared: they
+see mostly the border. That two images end at the same place is no evidence."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ agree: a third of the error of tracks for each pixel."""
 MIN_ALIGNED, MIN_SHARE, MIN_FAR_SHARE = 0.8, 0.08, 0.02
 """A scene has depth if at least the first fraction of the places off the plane agrees with an
 epipole, and of all places the second fraction is off the plane and agrees, or the third is so by
-more than `FAR` times the noise, as a post before a wall. By chance, .16 of the places agree."""
+more than `FAR` times the noise, as a post before a wall. By chance, 0.16 of the places agree."""
 
 FAR = 3.0
 
