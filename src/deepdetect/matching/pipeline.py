@@ -32,7 +32,7 @@ from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, at_pixels, load_pair
 from ..io.projection import require_pinhole
 from .guided import Explanation, ImagePair
-from .overlay import scene_of
+from .overlay import scene_of, tell_still
 
 GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
 """The stages that `match_images` reports."""
@@ -224,7 +224,7 @@ def match_features(
 def _noted(matches: Matches, left_out: float) -> Matches:
     if not left_out or (geometry := matches.geometry) is None:
         return matches
-    evidence = replace(geometry.evidence, left_out=left_out)
+    evidence = replace(geometry.evidence, left_out=left_out + geometry.evidence.left_out)
     return replace(matches, geometry=replace(geometry, evidence=evidence))
 
 
@@ -242,6 +242,7 @@ def _match_guided(
     with timer.stage("guided matching"):
         explanation = Explanation(pair, keypoints, guiding, given, seed)
         guide, matched = explanation.answer()
+        tell_still(guide.evidence.left_out)
     if matched is None:
         return _no_matches(*keypoints, guide, timer)
     points = matched.starts(explanation.pixels[0]), matched.points1

@@ -14,7 +14,7 @@ from ...features.matches import MAX_KEYPOINT_DISTANCE_PX, GuidedMatches, TwoView
 from ...features.matches import Evidence as PublicEvidence
 from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
-from ...geometry.transforms import transfer_errors
+from ...geometry.transforms import outer_corners, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
 from .along_plane import match_along_plane, refined
 from .along_rows import match_by_rectification
@@ -45,6 +45,10 @@ OFF_RATIO = 4.0
 MIN_GAIN = 1.05
 """A plane moves on its own if a fundamental matrix of the rest alone fits this many times as many
 matches of the rest as the matrix of all, and less than a third of those on the plane."""
+
+MIN_MOVING = 0.5
+"""What stands still is left out if a geometry that moves explains at least this fraction of as many
+windows: a caption, a part of the vehicle. With less, something moves before a still camera."""
 
 MAX_LAYERS = 4
 """Maximum number of geometries of one pair: one of the scene, others of what moves on its own."""
@@ -90,6 +94,7 @@ class Explanation:
         self.tried = Tentative(np.empty((0, 2)), np.empty((0, 2)))
         self.best_nfa = np.inf
         self.refuted = False
+        self.left_out = 0.0
 
     @cached_property
     def layers(self) -> list[Layer]:
@@ -123,7 +128,23 @@ class Explanation:
                 break
             layers.append(further)
             explained = explained | further.evidence.explained
-        return sorted(layers, key=lambda layer: -layer.evidence.windows)
+        layers.sort(key=lambda layer: -layer.evidence.windows)
+        moving = [layer for layer in layers if not self._stands_still(layer)]
+        least = MIN_MOVING * layers[0].evidence.windows
+        if moving and moving[0].evidence.windows >= least:
+            self.left_out = float(
+                sum(each.evidence.explained.mean() for each in layers if each not in moving)
+            )
+            return moving
+        return layers
+
+    def _stands_still(self, layer: Layer) -> bool:
+        """Return whether nothing that a layer explains moves."""
+        if layer.hypothesis.model != "homography" or self._pair.sizes[0] != self._pair.sizes[1]:
+            return False
+        corners = outer_corners(self._pair.sizes[0])
+        motion = layer.hypothesis.errors(corners, corners)
+        return bool(motion.max() < layer.hypothesis.threshold_px)
 
     def _seen(self, cross_modal: bool) -> tuple[ImagePair, Judge]:
         if cross_modal not in self._judges:
@@ -302,6 +323,7 @@ class Explanation:
             verified=first.evidence.share,
             agreement=first.evidence.agreement,
             correlation=first.evidence.correlation,
+            left_out=self.left_out,
         )
         geometry = TwoViewGeometry(
             own.model, own.matrix, "none", "high" if high else "fair", evidence

@@ -47,7 +47,7 @@ SEPARATION_PX = 2.0
 because one corner that is found twice is no further evidence."""
 
 MAX_PLANES = 3
-"""This number of homographies are tried at most, each from the matches that the ones before leave. A facade
+"""This number of homographies are tried at most, each from the matches that are left. A facade
 that is off by one window in either direction takes two."""
 
 MIN_MATCHES = 8
