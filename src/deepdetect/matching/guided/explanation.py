@@ -12,6 +12,7 @@ from ..._shared.errors import ImageError
 from ...features.keypoints import Keypoints, nearest_keypoints
 from ...features.matches import MAX_KEYPOINT_DISTANCE_PX, GuidedMatches, TwoViewGeometry
 from ...features.matches import Evidence as PublicEvidence
+from ...geometry.camera import Size
 from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.transforms import outer_corners, transfer_errors
@@ -45,6 +46,10 @@ OFF_RATIO = 4.0
 MIN_GAIN = 1.05
 """A plane moves on its own if a fundamental matrix of the rest alone fits this many times as many
 matches of the rest as the matrix of all, and less than a third of those on the plane."""
+
+MAX_STILL = 0.005
+"""Motions of less than this fraction of the longer side may be errors: 3 pixels of 640, the inlier
+threshold of a homography."""
 
 MIN_MOVING = 0.5
 """What stands still is left out if a geometry that moves explains at least this fraction of as many
@@ -129,7 +134,12 @@ class Explanation:
             layers.append(further)
             explained = explained | further.evidence.explained
         layers.sort(key=lambda layer: -layer.evidence.windows)
-        moving = [layer for layer in layers if not self._stands_still(layer)]
+        moving = [
+            layer
+            for layer in layers
+            if layer.hypothesis.model != "homography"
+            or not stands_still(layer.hypothesis.matrix, self._pair.sizes)
+        ]
         least = MIN_MOVING * layers[0].evidence.windows
         if moving and moving[0].evidence.windows >= least:
             self.left_out = float(
@@ -137,14 +147,6 @@ class Explanation:
             )
             return moving
         return layers
-
-    def _stands_still(self, layer: Layer) -> bool:
-        """Return whether nothing that a layer explains moves."""
-        if layer.hypothesis.model != "homography" or self._pair.sizes[0] != self._pair.sizes[1]:
-            return False
-        corners = outer_corners(self._pair.sizes[0])
-        motion = layer.hypothesis.errors(corners, corners)
-        return bool(motion.max() < layer.hypothesis.threshold_px)
 
     def _seen(self, cross_modal: bool) -> tuple[ImagePair, Judge]:
         if cross_modal not in self._judges:
@@ -174,15 +176,19 @@ class Explanation:
             if not evidence.confirms:
                 sparse.append(plane)
                 continue
+            least = 1 / 2 if evidence.share >= NEARLY_ALL else MOST
+            only_part = epipolar is not None and not _mostly(plane.inliers, epipolar.inliers, least)
+            matrix = plane.matrix
+            if not only_part:
+                matrix = refined(pair, matrix)
+                view = judge.along_plane(matrix)
+                evidence = self._on_free(view.evidence, free)
             if view.repeated:
                 refuted |= plane.inliers
                 continue
-            least = 1 / 2 if evidence.share >= NEARLY_ALL else MOST
-            if epipolar is not None and not _mostly(plane.inliers, epipolar.inliers, least):
+            if only_part:
                 part = plane
                 break
-            matrix = refined(pair, plane.matrix)
-            evidence = self._on_free(judge.along_plane(matrix).evidence, free)
             plane = replace(plane, matrix=matrix)
             matches = match_along_plane(pair, self.pixels, matrix, judge, evidence)
             if len(matches) >= self._enough:
@@ -356,6 +362,13 @@ class Explanation:
         count = int(np.count_nonzero(off))
         evidence = replace(geometry.evidence, on_plane=len(points0) - count, off_plane=count)
         return replace(geometry, scene="depth with a dominant plane", evidence=evidence)
+
+
+def stands_still(homography: np.ndarray, sizes: tuple[Size, Size]) -> bool:
+    """Return whether a homography between images of one size moves nothing."""
+    corners = outer_corners(sizes[0])
+    motion = transfer_errors(corners, corners, homography)
+    return sizes[0] == sizes[1] and bool(motion.max() < MAX_STILL * max(sizes[0]))
 
 
 def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:

@@ -28,7 +28,7 @@ from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 from ...io.image import luma
 from ..guided import ImagePair, Tentative
 from ..guided.along_plane import match_along_plane, refined
-from ..guided.explanation import MIN_MATCHED_FRACTION, straight_lines
+from ..guided.explanation import MIN_MATCHED_FRACTION, stands_still, straight_lines
 from ..guided.judge import Judge
 from ..guided.proposals import (
     LEARNED_KEYPOINTS,
@@ -56,6 +56,10 @@ MAX_DISAGREEMENT_PX = 2.0
 
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
+
+MIN_STILL = 0.9
+"""Two images from one place show the same nearly everywhere. With less than this fraction explained
+by no motion, what stands still is a menu or a caption."""
 
 MIN_EXPLAINED = 0.3
 """Two images contradict their homography if it explains less than this fraction of what can be
@@ -240,7 +244,8 @@ def _register(
     judge = Judge(pair)
     matrix = refined(pair, homography)
     view = judge.along_plane(matrix)
-    if not view.confirmed:
+    still = stands_still(homography, pair.sizes)
+    if not view.confirmed or (still and view.evidence.share < MIN_STILL):
         return None
     pixels = np.rint(a.keypoints), np.rint(b.keypoints)
     matches = match_along_plane(pair, pixels, matrix, judge, view.evidence)
