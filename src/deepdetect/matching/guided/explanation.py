@@ -194,7 +194,7 @@ class Explanation:
             if len(matches) >= self._enough:
                 flat = Layer(plane, matches, evidence)
             break
-        if epipolar is not None and _mostly(refuted, epipolar.inliers):
+        if epipolar is not None and _mostly(refuted, epipolar.inliers, 1 / 2):
             epipolar = None  # it explains the same pattern
         if epipolar is not None:
             epipolar = self._apart(pair, flats, epipolar)

@@ -61,10 +61,11 @@ the first fraction of the geometry's, and this fraction of the overlap remains. 
 have copies of up to 0.3, facades of one repeated window 0.6 or more. A lattice has four nearest
 copies."""
 
-MIN_WON, MIN_WON_RATIO = 0.025, 2.0
+MIN_WON, MIN_WON_RATIO = 0.0125, 1.5
 """A geometry must explain at least the first fraction of its cells clearly better than a copy does,
 and the second value times as many as the copy explains better. On facades with one window that is
-unlike the others, the fraction is 0.032 or more; if all are alike, 0.019 or less for some copy."""
+unlike the others, the fraction is 0.03 or more, on a truss 0.017; if all windows are alike, up
+to 0.012 for some copy, and 0.002 without the frames of the images."""
 
 MIN_TIED = 0.5
 """A copy competes with a geometry if it explains at least this fraction of its cells as well. One

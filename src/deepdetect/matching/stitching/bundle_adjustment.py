@@ -49,8 +49,7 @@ class RegisteredPair:
     """The numbers of two images, and the homography between them that dense keypoints confirm.
 
     `points`, (M, 2), are matched keypoints of the first image: all, or some if there are many.
-    `matches` is the number of all matches, `explained` the fraction of what both images show in
-    common that the homography explains.
+    `matches` is the number of all matches.
     """
 
     first: int
@@ -58,7 +57,6 @@ class RegisteredPair:
     homography: np.ndarray
     points: np.ndarray
     matches: int
-    explained: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
