@@ -125,6 +125,12 @@ class GuidedMatches:
         """Return the (M, 2) positions in the first image; its keypoints lie at `xy0`."""
         return xy0[self.indices0] if self.points0 is None else self.points0
 
+    def chosen(self, rows: np.ndarray) -> GuidedMatches:
+        """Return some of the matches along epipolar lines."""
+        return GuidedMatches(
+            self.indices0[rows], self.points1[rows], self.scores[rows], self.subpixel
+        )
+
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
         """Return these matches and those of `other` that the mask `chosen` selects."""
         order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")

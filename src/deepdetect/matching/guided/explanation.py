@@ -209,7 +209,8 @@ class Explanation:
                 sparse.append(epipolar)
         if flat is not None:
             yield flat
-        self.refuted = free is None and refuted.any() and flat is None and epipolar is None
+        nothing = free is None and flat is None and epipolar is None
+        self.refuted = nothing and bool(refuted.any())
         sparse = [each for each in sparse if each.log10_nfa < MAX_SPARSE_LOG10_NFA]
         if not self.refuted and sparse and free is None:
             best = min(sparse, key=lambda each: each.log10_nfa)
@@ -263,8 +264,7 @@ class Explanation:
             return None
         matrix, both = found
         own = both.indices0 < count
-        columns = both.indices0, both.points1, both.scores
-        matches = GuidedMatches(*(each[own] for each in columns), subpixel=True)
+        matches = both.chosen(own)
         starts = matches.starts(self.pixels[0])
         # The lattice is judged, so that the answer does not depend on where keypoints are.
         view = judge.along_matches(everywhere[both.indices0[~own]], both.points1[~own])
@@ -272,9 +272,7 @@ class Explanation:
         if not evidence.confirms or view.repeated:
             return None
         if free is not None:
-            inside = evidence.explained[judge.cells_of(starts)]
-            columns = matches.indices0, matches.points1, matches.scores
-            matches = GuidedMatches(*(each[inside] for each in columns), subpixel=True)
+            matches = matches.chosen(evidence.explained[judge.cells_of(starts)])
         return Layer(replace(epipolar, matrix=matrix), matches, evidence)
 
     def _sparse(self, hypothesis: Hypothesis) -> Layer | None:

@@ -304,9 +304,9 @@ class View:
                 known = np.isfinite(own) & np.isfinite(copy)
                 explained = known & (own > bound)
                 won = explained & (own - copy > spread) & ~(recurring > bound)
-                lost = np.count_nonzero(known & (copy > bound) & (copy - own > spread))
+                better = np.count_nonzero(known & (copy > bound) & (copy - own > spread))
                 tied = np.count_nonzero(explained & ~(own - copy > spread))
-            lost -= FALSE_POSITIVE_RATE * np.count_nonzero(known & ~explained)
+            lost = better - FALSE_POSITIVE_RATE * np.count_nonzero(known & ~explained)
             total = np.count_nonzero(explained)
             if tied < MIN_TIED * total:
                 continue
@@ -330,7 +330,7 @@ class View:
         return (cells @ self._axes).reshape(*shape, DIMENSIONS)
 
     def _displaced(self, x: int, y: int) -> np.ndarray:
-        field = np.broadcast_to(np.float64([x, y]), (*self._valid.shape, 2))
+        field = np.broadcast_to(np.array([x, y], np.float64), (*self._valid.shape, 2))
         return _gathered(self._first, self._second, self._valid, field)
 
     def _similar_shifts(self) -> np.ndarray:
