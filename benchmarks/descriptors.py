@@ -43,13 +43,14 @@ import cv2
 import numpy as np
 
 from deepdetect import Keypoints, Matches, PointDetector, match_features
-from deepdetect.features.sift import detect_sift
+from deepdetect.features.sift import describe_keypoints
 from deepdetect.geometry import GeometryOptions, estimate_geometry
 from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import load_image, luma
 from deepdetect_lab.datasets.planar import load_hpatches, load_oxford
 from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect_lab.evaluation.baselines.external import onnx_feature
+from deepdetect_lab.evaluation.baselines.opencv import STANDARD
 from deepdetect_lab.evaluation.metrics.homography import area_under_curve, corner_error
 from deepdetect_lab.evaluation.protocols.planar import pairs_of
 from deepdetect_lab.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
@@ -71,7 +72,11 @@ def methods(files: list[str]) -> dict[str, Extract]:
         for kind in ("rootsift", "learned", "learned-free", "cross-modal")
     }
     others = {Path(file).stem: _extract_other(file) for file in files}
-    return found | {"SIFT": lambda rgb: detect_sift(luma(rgb), KEYPOINTS)} | others
+    return found | {"SIFT": _extract_sift} | others
+
+
+def _extract_sift(rgb: np.ndarray) -> Keypoints:
+    return describe_keypoints(luma(rgb), STANDARD["sift"].detect(rgb).best(KEYPOINTS))
 
 
 def _extract_other(file: str) -> Extract:

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepdetect.geometry.two_view import choose_model
-
 SIZE = (640, 480)
 DIAGONAL = 800.0
 HOMOGRAPHY = np.array([[0.9, -0.2, 80], [0.15, 0.95, -20], [1e-4, -5e-5, 1]])
@@ -105,10 +103,10 @@ def test_a_scene_with_depth_has_an_epipolar_geometry(run_node: Any) -> None:
     assert agrees[:20].mean() < 0.3
 
 
-@pytest.mark.parametrize("wrong", [0, 60, 200])
+@pytest.mark.parametrize(("wrong", "enough"), [(0, 30), (60, 90), (200, 1000)])
 @pytest.mark.parametrize("in_front", [0, 10, 30, 90])
-def test_plane_or_depth_is_decided_as_in_the_package(
-    in_front: int, wrong: int, run_node: Any
+def test_what_lies_before_a_plane_is_depth_if_it_is_enough(
+    in_front: int, wrong: int, enough: int, run_node: Any
 ) -> None:
     """A plane with things in front of it, and wrong matches."""
     points0 = anywhere(150 + in_front + wrong)
@@ -118,5 +116,5 @@ def test_plane_or_depth_is_decided_as_in_the_package(
     points1[150 : 150 + in_front] += shifts[:, None] * (0.9, 0.3)
     points1[150 + in_front :] = anywhere(wrong, 2)
     points1 += random.normal(0, 0.5, points1.shape)
-    expected = choose_model(points0, points1, (SIZE, SIZE), "auto", 0, semi_calibrated=False)
-    assert estimate(run_node, points0, points1)[0] == expected.model
+    expected = "fundamental" if in_front >= enough else "homography"
+    assert estimate(run_node, points0, points1)[0] == expected

@@ -51,7 +51,7 @@ def run(
 def test_matching(examples: Path, tmp_path: Path) -> None:
     pytest.importorskip("numba")
     result, told = run("match", examples, ["coffee.jpg", "coffee-turned.jpg"], tmp_path)
-    stages = ["initial geometry", "keypoints", "guided matching", "geometry", "files"]
+    stages = ["keypoints", "guided matching", "geometry", "files"]
     assert [stage for stage, _, _ in told] == stages
     matches = load_matches(tmp_path / "matches.npz")
     assert result.numbers["Matches"] == f"{len(matches):,}"

@@ -13,19 +13,6 @@ from deepdetect.features import kernels
 RNG = np.random.default_rng(0)
 
 
-def test_correlation_distances_are_numpys() -> None:
-    first, second = RNG.integers(0, 256, (2, 30, 64), np.uint8)
-    mean = RNG.uniform(0, 255, 64).astype(np.float32)
-    rows0, rows1 = RNG.integers(0, 30, (2, 50))
-    found = np.zeros(50, np.float32)
-    kernels.correlation_distances(5, 45, first, rows0, second, rows1, mean, found)
-    for k in range(5, 45):
-        x, y = first[rows0[k]] - mean, second[rows1[k]] - mean
-        assert found[k] == pytest.approx(1 - x @ y / np.sqrt(x @ x * (y @ y)), abs=1e-5)
-    assert not found[:5].any()
-    assert not found[45:].any()
-
-
 def test_the_nearest_keypoint_is_looked_for_in_nine_pixels() -> None:
     height, width = 12, 15
     pixels = RNG.permutation(height * width)[:60]

@@ -8,10 +8,12 @@ from hypothesis.extra.numpy import arrays
 
 from deepdetect._shared.errors import OptionError
 from deepdetect.features.selection import (
+    GRID_CELLS,
     SelectionOptions,
     descending_order,
     grid_subsample,
     select_keypoints,
+    spread_over_grid,
     suppress_neighbors,
 )
 
@@ -231,3 +233,35 @@ def test_descending_order_is_that_of_a_stable_sort(dtype: type) -> None:
     values = np.concatenate([values, [-0.0, 0.0]]).astype(dtype)
     expected = np.argsort(-values, kind="stable")
     np.testing.assert_array_equal(descending_order(values), expected)
+
+
+def cells_of(xy: np.ndarray, size: tuple[int, int]) -> list[tuple[int, int]]:
+    side = max(size) / GRID_CELLS
+    return [(int(x // side), int(y // side)) for x, y in xy]
+
+
+@given(
+    count=st.integers(0, 80),
+    most=st.integers(0, 90),
+    size=st.tuples(st.integers(1, 500), st.integers(1, 500)),
+    clumped=st.floats(0, 3),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_spread_takes_cells_in_turn(
+    count: int, most: int, size: tuple[int, int], clumped: float, seed: int
+) -> None:
+    generator = np.random.default_rng(seed)
+    xy = generator.random((count, 2)) ** (1 + clumped) * size
+    strength = generator.permutation(count).astype(float)
+    rows = spread_over_grid(xy, strength, size, most).tolist()
+    assert len(rows) == len(set(rows)) == min(count, most)
+    cell = cells_of(xy, size)
+    waiting = {
+        one: sorted((k for k in range(count) if cell[k] == one), key=lambda k: -strength[k])
+        for one in set(cell)
+    }
+    expected = []
+    while any(waiting.values()):
+        turn = [members.pop(0) for members in waiting.values() if members]
+        expected += sorted(turn, key=lambda k: -strength[k])
+    assert rows == expected[:most]

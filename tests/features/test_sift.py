@@ -3,16 +3,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 
 from deepdetect import ImageError
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.scale_space import nearest_layers
 from deepdetect.features.sift import (
     DESCRIPTORS,
-    correlation_distance,
     dense_sift,
     describe_keypoints,
     opencv_sift_descriptors,
@@ -149,22 +145,6 @@ def test_many_keypoints_are_done_at_once_and_few_by_opencv() -> None:
     np.testing.assert_array_equal(
         sift_descriptors(gray, everywhere, 9.0), opencv_sift_descriptors(gray, everywhere, 9.0)
     )
-
-
-BYTES = arrays.arrays(np.uint8, (5, 16), elements=st.integers(0, 255))
-
-
-@given(BYTES, BYTES)
-def test_about_their_own_means_it_is_pearsons_correlation(
-    first: np.ndarray, second: np.ndarray
-) -> None:
-    """Each row and its own mirror image about 127: both have the mean 127.5 throughout."""
-    pair = [np.concatenate([part, 255 - part], axis=1) for part in (first, second)]
-    rows = np.arange(len(first))
-    mean = np.full(32, 127.5, np.float32)
-    found = correlation_distance(pair[0], rows, pair[1], rows, mean)
-    expected = [1 - np.corrcoef(a, b)[0, 1] for a, b in zip(*pair, strict=True)]
-    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)

@@ -8,13 +8,11 @@ from deepdetect.geometry.images import (
     edge_strength,
     erode_mask,
     gaussian_blur,
-    gaussian_means,
     local_zncc,
     median_local_zncc,
     normalise_local_contrast,
     warp_to_reference,
     window_sums,
-    zncc_at_points,
 )
 
 
@@ -93,26 +91,6 @@ def test_sums_are_those_of_brute_force(window: int) -> None:
         np.testing.assert_allclose(found, near @ values, atol=1e-9)
 
 
-@pytest.fixture
-def some() -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of a 30x20 image, each once, and their values."""
-    generator = np.random.default_rng(0)
-    chosen = generator.permutation(600)[:150]
-    return np.column_stack([chosen % 30, chosen // 30]), generator.normal(size=150)
-
-
-def test_means_are_weighted_by_a_gaussian(some: tuple[np.ndarray, np.ndarray]) -> None:
-    pixels, values = some
-    inner = pixels[((pixels > 7) & (pixels < (22, 12))).all(axis=1)]  # away from the border
-    squares = ((inner[:, None] - pixels) ** 2).sum(axis=2)
-    weights = np.exp(-squares / (2 * 1.5**2))
-    expected = weights @ values / weights.sum(axis=1)
-    found = gaussian_means(pixels, values, (20, 30), 1.5, inner)
-    np.testing.assert_allclose(found, expected, atol=2e-3)
-    same = gaussian_means(pixels, np.full(150, 7.0), (20, 30), 1.5, pixels)
-    np.testing.assert_allclose(same, 7, rtol=1e-5)
-
-
 def test_edges_do_not_tell_which_side_is_bright() -> None:
     gray = noise()
     edges = edge_strength(gray)
@@ -121,29 +99,3 @@ def test_edges_do_not_tell_which_side_is_bright() -> None:
     step[:, 20:] = 90
     assert (edge_strength(step).argmax(1) // 2 == 19 // 2).all()
     assert not edge_strength(np.full((40, 40), 7, np.uint8)).any()
-
-
-def test_windows_around_points_are_correlated() -> None:
-    image = gaussian_blur(noise(1, (80, 80)), 1)
-    points = np.array([[20.0, 30.0], [41.5, 40.0], [60.0, 12.5]])
-    moved = np.float32(shifted(image.astype(float), (3, 2), order=1))
-    same, inverted, chance = (
-        zncc_at_points((image, other), (points, to), 16)
-        for other, to in ((moved, points + (2, 3)), (255 - image, points), (image, points[::-1]))
-    )
-    np.testing.assert_allclose(same, 1, atol=1e-3)
-    np.testing.assert_allclose(inverted, -1, atol=1e-3)
-    assert np.abs(chance[[0, 2]]).max() < 0.5
-
-
-def test_more_points_than_opencv_takes_at_once_are_correlated() -> None:
-    """`cv2.remap` takes fewer than 32,767 rows."""
-    first, second = noise(0), noise(1) // 2 + noise(0) // 2
-    generator = np.random.default_rng(0)
-    points0, points1 = (generator.uniform(2, (77, 61), (33_001, 2)) for _ in range(2))
-    found = zncc_at_points((first, second), (points0, points1), 3)
-    parts = np.array_split(np.arange(33_001), 7)
-    expected = [zncc_at_points((first, second), (points0[k], points1[k]), 3) for k in parts]
-    assert found.shape == (33_001,)
-    np.testing.assert_array_equal(found, np.concatenate(expected))
-    assert np.abs(found).max() > 0.9

@@ -11,15 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Matches, match_images
+from deepdetect import DeepDetect, Matches, PointDetector, match_features, match_images
 from deepdetect._shared.errors import ReconstructionError
-from deepdetect.features.matchers import get_matcher, match_descriptors
-from deepdetect.features.sift import detect_sift
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.estimation import TwoViewModel
 from deepdetect.geometry.relative_pose import estimate_relative_pose
 from deepdetect.geometry.two_view import fit_model, has_foreground, is_planar
-from deepdetect.io.image import load_image, luma
+from deepdetect.io.image import load_image
 from deepdetect.reconstruction.subpixel import refine_matches
 from deepdetect.reconstruction.two_view import check_focal, check_matches, check_pose
 
@@ -29,14 +27,9 @@ SIZE = (370, 250)
 
 
 def sparse(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    described = [detect_sift(luma(image), 2000) for image in (first, second)]
-    found = match_descriptors(
-        *(features.descriptors for features in described),
-        get_matcher("exact"),
-        ratio=0.85,
-        mutual=True,
-    )
-    return described[0].xy[found.indices0], described[1].xy[found.indices1]
+    detector = PointDetector(2000, descriptor="rootsift")
+    found = match_features(*(detector.extract(image) for image in (first, second)))
+    return found.points0, found.points1
 
 
 def refusal(points: tuple[np.ndarray, ...], **known: Any) -> str:

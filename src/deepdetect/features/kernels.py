@@ -27,9 +27,6 @@ sigmas of the Gaussian window vote for them, as in OpenCV."""
 CHUNK = 64
 """Exact search keeps the minimum of each chunk of this many distances, to find rows faster."""
 
-MIN_SQUARED_NORMS = 1e-3
-"""Lower limit of the product of two squared norms, so that no correlation is divided by 0."""
-
 
 @compiled(nogil=True, fastmath=True)
 def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, taps, spans, out):  # type: ignore[no-untyped-def]
@@ -147,24 +144,6 @@ def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
                 value = min(histogram[b, c * numbers + o], most)
                 value = np.rint(value * scale)
                 out[32 * b + 8 * c + o] = np.uint8(min(np.float32(255), value))
-
-
-# Full fastmath would approximate division and root, and equal descriptors would not give 0.
-@compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
-def correlation_distances(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
-    """Write 1 - correlation of the descriptor pairs `start` to `stop` (exclusive) into `out`."""
-    for k in range(start, stop):
-        a, b = first[rows0[k]], second[rows1[k]]
-        both = np.float32(0)
-        one = np.float32(0)
-        other = np.float32(0)
-        for d in range(len(mean)):
-            x = np.float32(a[d]) - mean[d]
-            y = np.float32(b[d]) - mean[d]
-            both += x * y
-            one += x * x
-            other += y * y
-        out[k] = np.float32(1) - both / np.sqrt(max(one * other, np.float32(MIN_SQUARED_NORMS)))
 
 
 @compiled(nogil=True)

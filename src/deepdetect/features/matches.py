@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -33,17 +33,17 @@ class Evidence:
 
     Attributes:
         tentative_matches: number of tentative matches from which the geometry was first estimated.
-        tentative_inliers: number of tentative matches that agree with the geometry, plus further
-            matches that were found along its epipolar lines.
+        tentative_inliers: number of tentative matches that agree with the geometry.
         log10_nfa: decimal logarithm of the geometry's number of false alarms (a contrario): the
             expected number of geometries with as many inliers among random matches.
         simulated_views: number of views that were simulated to find the geometry, as in ASIFT.
         on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
-        verified: fraction of the matches proposed by the geometry that the images confirm. If only
-            sparse matches are returned, the `tentative_inliers` are the proposed matches.
-        correlation: median ZNCC between windows of the first image and their places in the second.
-            Each place is predicted by the matches around a window, not by those inside it, so it
-            shows the same content if the matches are correct. 0 if there are few matches.
+        verified: fraction of what both images show in common that the geometry explains: places
+            that are more similar than nearly all places of displaced copies.
+        agreement: fraction of the places with structure that do not contradict the geometry.
+        correlation: median correlation of the descriptors at places with structure. In a scene with
+            depth, the place in the second image is predicted by the matches around, not by those
+            at the place itself. 0 if there are few matches.
         left_out: share of the image that was left out, because it stands still while the scene
             moves: a frame, a caption, a logo, the own vehicle.
     """
@@ -55,6 +55,7 @@ class Evidence:
     on_plane: int = 0
     off_plane: int = 0
     verified: float = 0.0
+    agreement: float = 0.0
     correlation: float = 0.0
     left_out: float = 0.0
 
@@ -124,6 +125,12 @@ class GuidedMatches:
         """Return the (M, 2) positions in the first image; its keypoints lie at `xy0`."""
         return xy0[self.indices0] if self.points0 is None else self.points0
 
+    def chosen(self, rows: np.ndarray) -> GuidedMatches:
+        """Return some of the matches along epipolar lines."""
+        return GuidedMatches(
+            self.indices0[rows], self.points1[rows], self.scores[rows], self.subpixel
+        )
+
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
         """Return these matches and those of `other` that the mask `chosen` selects."""
         order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")
@@ -134,29 +141,6 @@ class GuidedMatches:
         indices1 = None if self.indices1 is None or other.indices1 is None else both("indices1")
         columns = both("indices0"), both("points1"), both("scores")
         return GuidedMatches(*columns, self.subpixel, indices1)
-
-
-class _Lazy:
-    """A field that holds keypoints, or a function that finds them on first access."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, instance: Any, owner: type | None = None) -> Keypoints:
-        if instance is None:
-            raise AttributeError(self.name)  # tells `dataclass` that the field has no default
-        keypoints = instance.__dict__[self.name]
-        if not isinstance(keypoints, Keypoints):
-            keypoints = instance.__dict__[self.name] = keypoints()
-        return keypoints
-
-    def __set__(self, instance: Any, value: Any) -> None:
-        instance.__dict__[self.name] = value
-
-
-def lazy(find: Callable[[], Keypoints]) -> Keypoints:
-    """Wrap a function that finds keypoints as a field of `Matches`, called on first access."""
-    return cast(Keypoints, find)
 
 
 @suggest_keywords
@@ -170,15 +154,12 @@ class Matches:
             guided the matching, `points0` are pixels with keypoints, and `points1` the places where
             the second image shows these pixels; with `mutual`, the images may have swapped these
             roles. Otherwise all positions are keypoints.
-        scores: (M,) float32 in [0, 1], higher is better. If a homography guided the matching, 1 -
-            the dissimilarity of the two patches (at a score of 0, they are just more similar than
-            unrelated patches). If a fundamental matrix guided the matching, the correlation of the
-            patches. Otherwise, 1 - Lowe's ratio.
+        scores: (M,) float32 in [0, 1], higher is better. If geometry guided the matching,
+            the correlation of both patches or of their descriptors. Otherwise, 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
             `GeometryOptions.inlier_threshold`; all matches if there is no geometry yet. Guided
             matches that the surrounding image contradicts are no inliers.
-        keypoints0, keypoints1: all keypoints of the two images. If no geometry was found, they may
-            be detected only when they are first accessed.
+        keypoints0, keypoints1: all keypoints of the two images.
         seconds: time of each stage of the matching, for both images together, by the stage's name.
         geometry: the geometry between the images; None for `match_features`, which estimates none.
         subpixel: whether the matching itself found sub-pixel positions in the second image, on the
@@ -211,8 +192,8 @@ class Matches:
     points1: np.ndarray
     scores: np.ndarray
     inliers: np.ndarray
-    keypoints0: Keypoints = _Lazy()  # type: ignore[assignment]
-    keypoints1: Keypoints = _Lazy()  # type: ignore[assignment]
+    keypoints0: Keypoints
+    keypoints1: Keypoints
     seconds: dict[str, float] = field(default_factory=dict)
     geometry: TwoViewGeometry | None = None
     subpixel: bool = False

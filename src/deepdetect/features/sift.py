@@ -16,7 +16,6 @@ from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .keypoints import Keypoints, on_pixels
 from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, packed_octaves, set_angles
-from .selection import spread_over_grid
 
 ROOT_SIFT: Final = "rootsift"
 """Value of `Keypoints.descriptor_type` for RootSIFT."""
@@ -27,10 +26,6 @@ which it is faster than describing keypoints one by one."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
-
-CONTRAST_THRESHOLDS, MIN_KEYPOINTS = (0.04, 0.01, 0.0025), 1000
-"""SIFT's contrast thresholds, which apply to the contrast times the number of layers, as in OpenCV.
-The first is Lowe's. While there are fewer keypoints than the second value, the next is tried."""
 
 ROWS_AT_ONCE = 1024
 """This many descriptors are converted to RootSIFT at a time: they stay in the processor's cache."""
@@ -223,56 +218,6 @@ def _square_root(start: int, stop: int, descriptors: np.ndarray) -> None:
         rows[:] = np.minimum(values, 255, out=values)
 
 
-def correlation_distance(
-    first: np.ndarray, rows0: np.ndarray, second: np.ndarray, rows1: np.ndarray, mean: np.ndarray
-) -> np.ndarray:
-    """Return 1 - correlation of K pairs of uint8 descriptors, (K,) float32.
-
-    A pair is a row of `first`, (N, D), given in `rows0`, (K,), and a row of `second`, (M, D), given
-    in `rows1`, (K,). `mean`, (D,) float32, is subtracted from all descriptors first. The result is
-    1 if a descriptor equals the mean, and otherwise 0 for equal descriptors.
-    """
-    from .kernels import correlation_distances
-
-    rows0, rows1 = (np.ascontiguousarray(rows, np.int64) for rows in (rows0, rows1))
-    mean = np.ascontiguousarray(mean, np.float32)
-    out = np.empty(len(rows0), np.float32)
-    parallel_for(len(out), correlation_distances, first, rows0, second, rows1, mean, out)
-    return out
-
-
 Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
 
 DESCRIPTORS: dict[str, Descriptor] = {"sift": sift_descriptors, "rootsift": root_sift_descriptors}
-
-
-def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
-    """Detect SIFT keypoints, spread over a (H, W) uint8 image, with RootSIFT descriptors.
-
-    The keypoints have sizes, angles and octaves. Descriptors are rotated to the keypoints' angles.
-    """
-    size = (gray.shape[1], gray.shape[0])
-    # SIFT runs once, as nearly all time goes into the pyramid; higher thresholds are applied below.
-    # Without precise upscaling, OpenCV's positions are off by a quarter of a pixel.
-    sift = cv2.SIFT_create(
-        nOctaveLayers=LAYERS,
-        contrastThreshold=min(CONTRAST_THRESHOLDS),
-        enable_precise_upscale=True,
-    )
-    keypoints = sift.detect(gray, None)
-    strength = np.array([keypoint.response for keypoint in keypoints])
-    for threshold in CONTRAST_THRESHOLDS:
-        strong = np.flatnonzero(LAYERS * strength >= threshold)
-        if len(strong) >= min(MIN_KEYPOINTS, max_keypoints):
-            keypoints, strength = [keypoints[k] for k in strong], strength[strong]
-            break
-    if not len(keypoints) or max_keypoints < 1:
-        none = np.empty((0, 128), np.uint8)
-        return replace(Keypoints.empty(size), descriptors=none, descriptor_type=ROOT_SIFT)
-    xy = cv2.KeyPoint_convert(keypoints)
-    chosen = spread_over_grid(xy, strength, size, max_keypoints)
-    described, descriptors = sift.compute(gray, [keypoints[k] for k in chosen])
-    root = to_root_sift(descriptors.astype(np.uint8))
-    return replace(
-        Keypoints.from_opencv(described, size), descriptors=root, descriptor_type=ROOT_SIFT
-    )

@@ -10,7 +10,7 @@ is kept only if this improves more windows than it worsens.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -24,7 +24,6 @@ from .images import (
     erode_mask,
     gaussian_blur,
     local_zncc,
-    median_local_zncc,
     normalise_local_contrast,
     track_round_trip,
     warp_to_reference,
@@ -102,18 +101,6 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         if correction is not None:
             current = current @ correction
     return current / current[2, 2]
-
-
-def most_alike(
-    gray0: np.ndarray, gray1: np.ndarray, homographies: Sequence[np.ndarray]
-) -> np.ndarray:
-    """Return the homography under which reduced copies of two images correlate best."""
-    (first, scale0), (second, scale1) = (downscale(g, ALIGNMENT_SIDE_PX) for g in (gray0, gray1))
-
-    def correlation(homography: np.ndarray) -> float:
-        return median_local_zncc(first, second, scaled_homography(homography, scale0, scale1))
-
-    return max(homographies, key=correlation)
 
 
 def _fit_to_corners(

@@ -215,16 +215,6 @@ def window_sums(
     return sums[y, x]
 
 
-def gaussian_means(
-    pixels: np.ndarray, values: np.ndarray, shape: Sequence[int], sigma_px: float, at: np.ndarray
-) -> np.ndarray:
-    """Average the values around each pixel `at` with Gaussian weights, (M,); see `window_sums`."""
-    count, total = (_scatter(pixels, part, shape, np.float32) for part in (1, values))
-    count, total = (cv2.GaussianBlur(image, (0, 0), sigma_px) for image in (count, total))
-    x, y = at.T
-    return (total / np.maximum(count, 1e-6))[y, x]
-
-
 def _scatter(
     pixels: np.ndarray,
     values: np.ndarray | np.generic | float,
@@ -290,25 +280,6 @@ def equalise(gray: np.ndarray) -> np.ndarray:
 
 WINDOWS_AT_ONCE = 4096
 """`zncc_at_points` processes at most this number of windows at once, which bounds the memory."""
-
-
-def zncc_at_points(
-    images: tuple[np.ndarray, np.ndarray], points: tuple[np.ndarray, np.ndarray], side: int
-) -> np.ndarray:
-    """Return the (M,) ZNCC of blurred windows around (M, 2) matched points; `side` is in pixels."""
-    blurred = [gaussian_blur(image, BLUR_SIGMA_PX) for image in images]
-    offsets = np.indices((side, side))[::-1].reshape(2, -1) - (side - 1) / 2
-    correlations = np.empty(len(points[0]))
-    for start in range(0, len(correlations), WINDOWS_AT_ONCE):
-        part, patches = slice(start, start + WINDOWS_AT_ONCE), []
-        for image, at in zip(blurred, points, strict=True):
-            x, y = (at[part].T[:, :, None] + offsets[:, None]).astype(np.float32)
-            values = cv2.remap(image, x, y, cv2.INTER_LINEAR)
-            values = values - values.mean(axis=1, keepdims=True, dtype=np.float64)
-            norms = np.linalg.norm(values, axis=1, keepdims=True)
-            patches.append(values / np.maximum(norms, 1e-9))
-        correlations[part] = (patches[0] * patches[1]).sum(axis=1)
-    return correlations
 
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99

@@ -7,8 +7,6 @@ matches that the homography does not explain.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from .camera import Calibration, Camera, Size
@@ -21,7 +19,7 @@ from .estimation import (
     log10_nfa,
     measure_parallax,
 )
-from .semi_calibrated import START_FOCAL_LENGTHS, estimate_semi_calibrated
+from .semi_calibrated import START_FOCAL_LENGTHS
 from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
@@ -64,42 +62,6 @@ def fit_model(
         return TwoViewModel("none", None, geometry.inliers, float("inf"))
     alarms = log10_nfa(geometry.inliers, model, threshold_px, size1)
     return TwoViewModel(model, geometry.matrix, geometry.inliers, alarms)
-
-
-def choose_model(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    sizes: tuple[Size, Size],
-    model: str,
-    seed: int,
-    semi_calibrated: bool = True,
-) -> TwoViewModel:
-    """Return the model that may guide matching; many of the matches may be wrong.
-
-    `model` is "homography", "fundamental" or "auto". For "auto", a trusted homography is returned
-    unless the other matches show depth. Otherwise the fundamental matrix is returned if it is
-    trusted or has fewer false alarms than the homography. With `semi_calibrated`, the fundamental
-    matrix may come from `estimate_semi_calibrated`, which needs fewer correct matches but more
-    time. The caller must check whether the result is `trusted`.
-    """
-    plane = TwoViewModel("none", None, np.zeros(len(points0), bool), float("inf"))
-    if model != "fundamental":
-        threshold_px = GUIDING_THRESHOLDS_PX["homography"]
-        plane = fit_model(points0, points1, "homography", sizes[1], threshold_px, seed)
-        if model == "homography":
-            return plane
-        if plane.matrix is not None and plane.trusted:
-            parallax = measure_parallax(points0, points1, plane.matrix, seed)
-            plane = replace(plane, parallax=parallax)
-            if not parallax.shows_depth:
-                return plane
-    threshold_px = GUIDING_THRESHOLDS_PX["fundamental"]
-    depth = fit_model(points0, points1, "fundamental", sizes[1], threshold_px, seed)
-    if semi_calibrated:
-        known = estimate_semi_calibrated(points0, points1, sizes, threshold_px, seed)
-        if known is not None and known.log10_nfa < depth.log10_nfa:
-            depth = known
-    return depth if depth.trusted or depth.log10_nfa < plane.log10_nfa else plane
 
 
 def classify_scene(

@@ -1,7 +1,3 @@
-from .guided import (
-    TentativeMatches as TentativeMatches,
-    find_tentative_matches as find_tentative_matches,
-)
 from .pipeline import (
     match_features as match_features,
     match_images as match_images,

@@ -17,9 +17,9 @@ from .._shared.opencv import cv2
 from ..features.selection import check_ignore
 from ..geometry.frames import FRAME_MARGIN_PX, filled_smoothly, uniform_frame, widened
 from ..geometry.images import BLUR_SIGMA_PX, downscale, gaussian_blur
-from ..geometry.two_view import choose_model
 from ..io.image import luma
-from .guided.tentative_matches import Pair, find_tentative_matches
+from .guided import ImagePair, Pair, Sources
+from .guided.proposals import propose
 
 COMPARED_SIDE_PX = 640
 """Images are reduced to this longer side before they are compared: captions stay legible in it. All
@@ -30,7 +30,7 @@ WINDOW_PX, MAX_DIFFERENCE, MIN_GRADIENTS = 7, 0.3, 32.0
 gradients is below the second value times the sum of both, and this sum is above the third: 2 grey
 levels per pixel in each image, as Sobel's filter scales them."""
 
-MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 0.75, 3.0, 8
+MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
 """A match stands still if it moves by less than the first value, about the error of a keypoint. The
 scene clearly moves at a place if this number of its nearest moving matches move by more than the
 second. At the end of a street, which hardly moves for a camera that drives along it, few do."""
@@ -148,18 +148,25 @@ def _contradicted(still: np.ndarray, pair: Pair, seed: int) -> np.ndarray:
 
     if not stands(still & known).any():  # before the matching, which takes longest
         return np.zeros(still.shape, bool)
-    tentative = find_tentative_matches(*pair)
+    both = ImagePair(pair)
+    tentative = Sources(both).learned
     motion = tentative.points1 - tentative.points0
     moves = np.linalg.norm(motion, axis=1) > MAX_STILL_PX
     standing, scene, motion = tentative.points0[~moves], tentative.points0[moves], motion[moves]
-    model = choose_model(scene, scene + motion, (size, size), "auto", seed, semi_calibrated=False)
+    proposed = (
+        propose(both, tentative.chosen(moves), model, seed)
+        for model in ("homography", "fundamental")
+    )
+    found = min(filter(None, proposed), key=lambda each: each.log10_nfa, default=None)
     exactly = still & known & (np.linalg.norm(shift, axis=2) < MAX_SHIFT_PX)
     column, row = np.rint(scene).astype(int).T
-    tells = model.inliers & ~exactly[row, column]  # a keypoint that moves there is inexact
+    if found is None:
+        return np.zeros(still.shape, bool)
+    tells = found.inliers & ~exactly[row, column]  # a keypoint that moves there is inexact
     scene, motion = scene[tells], motion[tells]
     cells, moving_cells = (len(np.unique(xy // CELL_PX, axis=0)) for xy in (standing, scene))
     # If more of the image stands still than moves, something moves before a still camera.
-    if not model.trusted or len(scene) < NEIGHBOURS or cells > moving_cells:
+    if len(scene) < NEIGHBOURS or cells > moving_cells:
         return np.zeros(still.shape, bool)
     flow, least = _motion_of_scene(scene, motion, size)
     ends = np.float32(np.dstack(np.meshgrid(*map(np.arange, size)))) + flow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -24,20 +24,18 @@ from ..features.matchers import (
     get_matcher,
     match_descriptors,
 )
-from ..features.matches import Matches, TwoViewGeometry, lazy
+from ..features.matches import Matches, TwoViewGeometry
 from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, at_pixels, load_pair
 from ..io.projection import require_pinhole
-from .guided import TentativeMatches, guided_matches, guiding_geometry
-from .guided.tentative_matches import checked_positions
-from .overlay import scene_of
+from .guided import Explanation, ImagePair
+from .overlay import scene_of, tell_still
 
-GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
-"""The stages that `match_images` reports. "initial geometry" is reported only for a `DeepDetect`
-without masks; otherwise the initial geometry is part of "guided matching"."""
+GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
+"""The stages that `match_images` reports."""
 
 MAX_RETURN_ERROR_PX = 2.0
 """If `mutual`, a match is kept only if the reverse match that starts nearest to its end leads back
@@ -57,7 +55,7 @@ def match_images(
     ignore: np.ndarray | Images | None = None,
     model: str = "auto",
     mutual: bool = False,
-    tentative_matches: Points | TentativeMatches | None = None,
+    tentative_matches: Points | None = None,
     seed: int = 0,
     options: GeometryOptions = GeometryOptions(),
     progress: Callable[[str], object] | None = None,
@@ -79,8 +77,7 @@ def match_images(
         mutual: keep only one-to-one matches that are found in both directions, which takes twice
             the time. The order of the images then does not matter.
         tentative_matches: matches of another matcher (LightGlue, LoFTR, clicks), some of which may
-            be wrong: two (K, 2) arrays of corresponding positions, or the result of
-            `find_tentative_matches`. They replace our own SIFT matches in the initial geometry.
+            be wrong: two (K, 2) arrays of corresponding positions. They are asked before our own.
         seed: seed of all random choices.
         options: how the final geometry is estimated.
         progress: called with the name of each stage when it ends.
@@ -103,36 +100,30 @@ def match_images(
     """
     check_model(model, seed, options)
     guiding = "fundamental" if model == "essential" else model
-    source: Any = tentative_matches
-    if not (source is None or isinstance(source, TentativeMatches)):
-        source = checked_positions(source)
+    given = None if tentative_matches is None else _checked_positions(tentative_matches)
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
     masks: Sequence[np.ndarray | None]
     rgb, masks = load_pair((image0, image1), channels, ignore)
     if model != "homography":
         _require_pinholes((image0, image1), rgb, rim=False)
-    # The initial geometry does not use a network's keypoints, so they are detected after it; with
-    # masks of the caller or transparent pixels, they are detected before.
-    keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     grays, masks, left_out = scene_of(rgb, masks, seed)
-    if left_out and isinstance(source, TentativeMatches):
-        source = None  # they are of the whole images
     timer = StageTimer(progress)
-    find = [
-        cache(partial(find_keypoints, detector, image, selection, mask))
-        for image, mask in zip(rgb, masks, strict=True)
-    ]
-    settings = guiding, model, seed, options, keypoints_last, timer
-    matches = _match_guided(grays, (find[0], find[1]), source, *settings)
+    with timer.stage("keypoints"):
+        keypoints0, keypoints1 = (
+            find_keypoints(detector, image, selection, mask)
+            for image, mask in zip(rgb, masks, strict=True)
+        )
+    settings = guiding, model, seed, options, timer
+    pair = ImagePair(grays, masks)
+    matches = _match_guided(pair, (keypoints0, keypoints1), given, *settings)
     matches = _noted(_unmasked(matches, masks), left_out)
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
         _require_pinholes((image0, image1), rgb, rim=True)  # no eyepiece: no homography fits
     if not (mutual and matches.success):
         return matches
-    if source is not None:
-        source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
-    back = _match_guided(grays[::-1], (find[1], find[0]), source, *settings)
+    given = None if given is None else given[::-1]
+    back = _match_guided(pair.swapped(), (keypoints1, keypoints0), given, *settings)
     back = _noted(_unmasked(back, masks[::-1]), left_out)
     return _found_both_ways(matches, back)
 
@@ -233,42 +224,29 @@ def match_features(
 def _noted(matches: Matches, left_out: float) -> Matches:
     if not left_out or (geometry := matches.geometry) is None:
         return matches
-    evidence = replace(geometry.evidence, left_out=left_out)
+    evidence = replace(geometry.evidence, left_out=left_out + geometry.evidence.left_out)
     return replace(matches, geometry=replace(geometry, evidence=evidence))
 
 
 def _match_guided(
-    grays: tuple[np.ndarray, np.ndarray],
-    find: tuple[Callable[[], Keypoints], Callable[[], Keypoints]],
-    source: Any,
+    pair: ImagePair,
+    keypoints: tuple[Keypoints, Keypoints],
+    given: Points | None,
     guiding: str,
     model: str,
     seed: int,
     options: GeometryOptions,
-    keypoints_last: bool,
     timer: StageTimer,
 ) -> Matches:
     """Match the keypoints of the first image where a geometry predicts their partners."""
-    first = None
-    if keypoints_last:
-        with timer.stage("initial geometry"):
-            first = guiding_geometry(grays, guiding, seed, source)
-        if first.matrix is None:
-            guide = first.as_two_view_geometry()
-            return _no_matches(lazy(find[0]), lazy(find[1]), guide, timer)
-    with timer.stage("keypoints"):
-        keypoints = find[0](), find[1]()
     with timer.stage("guided matching"):
-        if first is None:
-            first = guiding_geometry(grays, guiding, seed, keypoints if source is None else source)
-        if guiding != "homography":
-            first.require_straight_lines(grays)
-        pixels = np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)
-        guide, matched = guided_matches(grays, pixels, first, seed)
+        explanation = Explanation(pair, keypoints, guiding, given, seed)
+        guide, matched = explanation.answer()
+        tell_still(guide.evidence.left_out)
     if matched is None:
         return _no_matches(*keypoints, guide, timer)
+    points = matched.starts(explanation.pixels[0]), matched.points1
     # If both ends are keypoints, their sub-pixel positions replace the rounded ones.
-    points = matched.starts(pixels[0]).astype(np.float32), matched.points1.astype(np.float32)
     if matched.indices1 is not None:
         points = keypoints[0].xy[matched.indices0], keypoints[1].xy[matched.indices1]
     with timer.stage("geometry"):
@@ -288,6 +266,21 @@ def _match_guided(
         matched.indices0,
         matched.indices1,  # type: ignore[arg-type]  # None: looked up later
     )
+
+
+def _checked_positions(points: Any) -> Points:
+    """Check sparse matches of another matcher; return two (K, 2) float64 arrays of positions."""
+    try:
+        points0, points1 = (np.array(each, np.float64) for each in points)
+    except (TypeError, ValueError):
+        points0 = points1 = np.empty(0)
+    if points0.ndim != 2 or points0.shape[1:] != (2,) or points0.shape != points1.shape:
+        raise OptionError(
+            "tentative matches must be two arrays of shape (K, 2): positions in both images"
+        )
+    if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
+        raise OptionError("tentative matches must be finite positions: leave out all other matches")
+    return points0, points1
 
 
 def _require_pinholes(images: tuple[Any, Any], rgb: Points, *, rim: bool) -> None:

@@ -117,10 +117,10 @@ def reconstruct(
     rgb, masks, _, known = _load_pair(images, channels, calibration, focal_px, ignore)
     grays, masks, left_out = scene_of(rgb, masks, seed)
     timer = StageTimer(progress)
-    tentative = rectification = None
+    rectification = None
     if rectified is None:
         with timer.stage("rectified or not"):
-            rectification, tentative = find_rectification(*grays, known.disparity_offset_px, seed)
+            rectification = find_rectification(*grays, known.disparity_offset_px, seed)
         rectified = rectification.rectified
         if rectification.swapped:
             offset = known.disparity_offset_px
@@ -148,7 +148,6 @@ def reconstruct(
                 # A homography would keep only the points on one plane.
                 model="fundamental",
                 seed=seed,
-                tentative_matches=tentative,
             )
         made = reconstruct_two_view(matches, grays, known, point_filter, seed, timer)
     columns, rows = np.rint(made["pixels"]).astype(np.int64).T

@@ -15,8 +15,9 @@ from .._shared.opencv import cv2
 from ..features.selection import grid_subsample
 from ..geometry.camera import Calibration
 from ..geometry.estimation import MAX_LOG10_NFA, log10_nfa
+from ..geometry.transforms import scaled_points
 from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_static
-from ..matching.guided import TentativeMatches, find_tentative_matches
+from ..matching.guided import ImagePair, Sources
 
 MAX_ROW_DISTANCE_PX = 1.0
 """A match of a rectified pair may lie at most this far from its row, and the values of cy of its
@@ -39,10 +40,6 @@ GRID_SIZE_PX = 8
 
 ITERATIONS = 500
 """RANSAC in `_best_other_rows` draws this number of samples of three matches. Chosen by hand."""
-
-COARSE_SIDE_PX, COARSE_KEYPOINTS = 480, 1000
-"""The coarse pass, which comes first, matches copies of the images whose longer side is
-COARSE_SIDE_PX, with at most COARSE_KEYPOINTS keypoints in each. Chosen by hand."""
 
 MIN_COARSE_INLIERS = 50
 """The coarse pass decides only if this many matches fit a fundamental matrix. Chosen by hand."""
@@ -115,42 +112,42 @@ class Rectification:
 
 def find_rectification(
     gray0: np.ndarray, gray1: np.ndarray, offset_px: float = 0.0, seed: int = 0
-) -> tuple[Rectification, TentativeMatches | None]:
+) -> Rectification:
     """Decide whether two (H, W) images are a rectified pair, from small copies if these suffice.
 
-    `offset_px` is the disparity offset of the calibration. If small copies do not suffice, the
-    tentative matches of larger copies are also returned, else None.
+    `offset_px` is the disparity offset of the calibration.
     """
     size = gray0.shape[::-1]
     if gray0.shape != gray1.shape:
         nowhere = np.empty((0, 2))
         nothing = detect_rectification(nowhere, nowhere, size, offset_px, seed)
-        return replace(nothing, reason="the images differ in size"), None
-    if max(size) > COARSE_SIDE_PX:
-        found = _coarse_pass(gray0, gray1, offset_px, seed)
-        if found is not None:
-            return found, None
-    tentative = find_tentative_matches(gray0, gray1)
-    points = tentative.points0, tentative.points1
-    return detect_rectification(*points, size, offset_px, seed), tentative
+        return replace(nothing, reason="the images differ in size")
+    sources = Sources(ImagePair((gray0, gray1)))
+    found = _coarse_pass(sources, size, offset_px, seed)
+    if found is not None:
+        return found
+    matches = sources.dense
+    return detect_rectification(matches.points0, matches.points1, size, offset_px, seed)
 
 
 def _coarse_pass(
-    gray0: np.ndarray, gray1: np.ndarray, offset_px: float, seed: int
+    sources: Sources, size: tuple[int, int], offset_px: float, seed: int
 ) -> Rectification | None:
     """Decide from small copies of two images of the same size; None if these do not suffice."""
-    coarse = find_tentative_matches(
-        gray0, gray1, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
-    )
-    scale, size = coarse.scales[0], coarse.views[0].shape[::-1]
+    coarse = sources.learned
+    scale = 1 / coarse.pixel
+    if scale == 1:
+        return None
+    small = round(size[0] * scale), round(size[1] * scale)
+    matched = scaled_points(coarse.points0, scale), scaled_points(coarse.points1, scale)
     # A distance of 1 px in the copies is more at full size, so the limit for rows is generous.
-    found = detect_rectification(*coarse.matched, size, offset_px * scale, seed)
+    found = detect_rectification(*matched, small, offset_px * scale, seed)
     if found.by_fundamental < MIN_COARSE_INLIERS:
         return None
     if found.rectified:
         on_rows = abs(found.disparities[1] + offset_px * scale) > MAX_ROW_DISTANCE_PX
         limit = MAX_COARSE_ROW_ERROR_PX * scale
-        decided = on_rows and _row_error(*coarse.matched, seed) < limit
+        decided = on_rows and _row_error(*matched, seed) < limit
     else:
         best = max(found.by_fundamental, found.by_other_rows)
         # Rejection needs a margin of three standard deviations of a binomial distribution.

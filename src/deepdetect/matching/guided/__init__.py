@@ -1,7 +1,7 @@
-"""Guided matching: a geometry from a few matches proposes dense matches, which are verified."""
+"""Guided matching: geometries are proposed, judged by the images, and predict dense matches."""
 
-from .initial_geometry import guiding_geometry
-from .pipeline import guided_matches
-from .tentative_matches import TentativeMatches, find_tentative_matches
+from .explanation import Explanation
+from .image_pair import ImagePair, Pair
+from .proposals import Sources, Tentative
 
-__all__ = ["TentativeMatches", "find_tentative_matches", "guided_matches", "guiding_geometry"]
+__all__ = ["Explanation", "ImagePair", "Pair", "Sources", "Tentative"]

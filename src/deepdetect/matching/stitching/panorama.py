@@ -20,7 +20,6 @@ from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_pixels, one_range
 from ...io.image_file import file_name, is_path, read_with
 from ...io.projection import require_pinhole
-from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .canvas import Canvas, least_distorted, plan_curved, plan_plane
 from .compositing import composite, crop_box
@@ -28,6 +27,10 @@ from .registration import JointRegistration, register_images
 
 Projection = Literal["plane", "cylindrical", "spherical"]
 PROJECTIONS = get_args(Projection)
+
+
+REGISTRATION_SIDES_PX = 100, 1200
+"""Range of `StitchingOptions.registration_side`. Larger images give no better homographies."""
 
 
 @suggest_keywords
@@ -52,7 +55,7 @@ class StitchingOptions:
         check_ranges(
             self,
             positive=("scale", "max_canvas_megapixels"),
-            between={"registration_side": (100, MAX_SIDE_PX)},
+            between={"registration_side": REGISTRATION_SIDES_PX},
         )
 
 

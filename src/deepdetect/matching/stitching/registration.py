@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -21,18 +21,24 @@ from ...detector.detector import AnyDetector, find_keypoints
 from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
-from ...features.sift import describe_keypoints, detect_sift
-from ...geometry.estimation import TwoViewModel
-from ...geometry.transforms import transfer_errors, transform_points
+from ...features.sift import describe_keypoints
+from ...geometry.images import downscale
+from ...geometry.transforms import scaled_points, transfer_errors, transform_points
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 from ...io.image import luma
-from ..guided import TentativeMatches, find_tentative_matches, guided_matches
-from ..guided.initial_geometry import InitialGeometry, estimate_initial_geometry
-from ..registration import agree
+from ..guided import ImagePair, Tentative
+from ..guided.along_plane import match_along_plane, refined
+from ..guided.explanation import MIN_MATCHED_FRACTION, stands_still, straight_lines
+from ..guided.judge import Judge
+from ..guided.proposals import (
+    LEARNED_KEYPOINTS,
+    LEARNED_SIDE_PX,
+    Hypothesis,
+    learned_points,
+    matched_points,
+    planes,
+)
 from .bundle_adjustment import RegisteredPair, RotatingCamera, adjust_cameras, adjust_homographies
-
-SIFT_KEYPOINTS = 2000
-"""Number of sparse keypoints per image to find overlaps. Chosen by hand; not measured."""
 
 MAX_KEYPOINTS = 30_000
 """Maximum number of dense keypoints per image that confirm a homography. Chosen by hand."""
@@ -45,18 +51,19 @@ MIN_OVERLAP = 0.1
 """An unregistered pair is tried again if the joint fit maps at least this fraction of one image's
 keypoints into the other image. Chosen by hand; not measured."""
 
-MAX_FURTHER_TRIALS = 2
-"""If dense matches reject a geometry, up to this many others are tried, which takes time."""
-
 MAX_DISAGREEMENT_PX = 2.0
 """A pair whose RMS distance from the joint fit exceeds this is tried again. Chosen by hand."""
 
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
-MAX_STILL_FRACTION = 0.05
-"""Images stand still if their matches move by less than this fraction of their extent: a homography
-of what stands still in screenshots bends by some pixels to the lines around it."""
+MIN_STILL = 0.9
+"""Two images from one place show the same nearly everywhere. With less than this fraction explained
+by no motion, what stands still is a menu or a caption."""
+
+MIN_EXPLAINED = 0.3
+"""A homography must explain at least this fraction of what both images show in common. Wrong ones
+of towers that are alike reach 0.12, screens of which half stands still 0.59."""
 
 MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
 """Images contradict each other if the RMS residual of their joint fit exceeds the inlier threshold
@@ -100,7 +107,7 @@ def register_images(
 ) -> JointRegistration:
     """Find the homographies of overlapping uint8 images of 3 or 4 channels to a common frame.
 
-    SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
+    Sparse points find overlaps and dense keypoints confirm homographies; the points of a detector
     without heat map do both. The largest group of connected images is registered, or the group that
     contains image number `reference`. If `turning`, cameras that only rotate are estimated as well.
     If `force`, images that contradict each other give a warning, not an error. `names` are those
@@ -139,7 +146,7 @@ def register_images(
     hint = "choose the projection 'plane'" if turning else "crop what stands still in all images"
     try:
         homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
-        again = _registered_again(views, to_common, pairs, seed)
+        again = _registered_again(views, to_common, pairs)
         if set(again) != set(pairs):
             pairs = again
             homographies, cameras, to_common, residual_px = _adjust(group, pairs, sizes, turning)
@@ -147,11 +154,7 @@ def register_images(
         raise RegistrationError(f"the images contradict each other: {hint}") from None
     worst = max(pairs, key=lambda pair: _disagreement_px(pair, to_common))
     off_px = _disagreement_px(worst, to_common)
-    grays = [view.gray for view in views]
-    unlike = [
-        not agree(grays[p.first], grays[p.second], p.homography, _stands_still(p)) for p in pairs
-    ]
-    if residual_px > MAX_RESIDUAL_PX or np.mean(unlike) > 0.5:  # a few wrong pairs are outvoted
+    if residual_px > MAX_RESIDUAL_PX:
         reason = (
             f"{names[worst.first]} and {names[worst.second]} contradict each other where they "
             f"overlap ({off_px:.1f} px in the panorama): leave one of them out, or {hint}"
@@ -185,13 +188,6 @@ def _disagreement_px(pair: RegisteredPair, to_common: dict[int, np.ndarray]) -> 
     return float(np.sqrt(np.mean(transfer_errors(pair.points, expected, matrix) ** 2)))
 
 
-def _stands_still(pair: RegisteredPair) -> bool:
-    """Return whether a pair's homography hardly moves its matches."""
-    moved = transform_points(pair.points, pair.homography)
-    extent = np.ptp(pair.points, axis=0).max()
-    return bool(np.abs(moved - pair.points).max() < MAX_STILL_FRACTION * extent)
-
-
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
     gray = luma(image)
     if not hasattr(detector, "heatmap"):
@@ -200,66 +196,70 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
         else:
             points = describe_keypoints(gray, find_keypoints(detector, image))
         return _Image(gray, points, np.rint(points.xy))
-    # The verification compares neighbouring pixels, so non-maximum suppression is off.
+    # Neighbouring pixels are verified together, so non-maximum suppression is off.
     keypoints = find_keypoints(detector, image, SelectionOptions(max_keypoints=MAX_KEYPOINTS))
-    return _Image(gray, detect_sift(gray, SIFT_KEYPOINTS), keypoints.xy)
+    small, scale = downscale(gray, LEARNED_SIDE_PX)
+    points = learned_points(small, LEARNED_KEYPOINTS)
+    points = replace(points, xy=scaled_points(points.xy, 1 / scale), image_size=gray.shape[::-1])
+    return _Image(gray, points, keypoints.xy)
 
 
 def _registered_pairs(
     views: Sequence[_Image], seed: int, done: Callable[[str], object]
 ) -> list[RegisteredPair]:
-    overlaps: list[tuple[InitialGeometry, TentativeMatches, int, int]] = []
+    overlaps: list[tuple[list[Hypothesis], int, int]] = []
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]
-        tentative = find_tentative_matches(a.gray, b.gray, (a.features, b.features))
-        geometry = estimate_initial_geometry(tentative, "homography", seed)
-        if geometry.model != "none":
-            geometry.require_straight_lines((a.gray, b.gray))
-            overlaps.append((geometry, tentative, first, second))
+        pair = ImagePair((a.gray, b.gray))
+        points0, points1, _ = matched_points(a.features, b.features)
+        pixel = max(1.0, max(b.gray.shape) / LEARNED_SIDE_PX)
+        found = [*planes(pair, Tentative(points0, points1, pixel), seed)]
+        if found:
+            straight_lines(pair, found[0])
+            overlaps.append((found, first, second))
         done("overlaps")
-    overlaps.sort(key=lambda overlap: -len(overlap[0].points0))
+    overlaps.sort(key=lambda overlap: -np.count_nonzero(overlap[0][0].inliers))
     pairs: list[RegisteredPair] = []
     partners = np.zeros(len(views), int)
-    for geometry, tentative, first, second in overlaps:
+    for found, first, second in overlaps:
         enough = partners[[first, second]].min() >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
-        pair = _register(views, first, second, geometry, seed)
-        for _ in range(MAX_FURTHER_TRIALS):
-            if pair is not None or geometry.matrix is None:
-                break
-            # Most matches on repeated structure may be wrong, so the others are tried alone.
-            tentative = tentative.apart_from(geometry.matrix)
-            geometry = estimate_initial_geometry(tentative, "homography", seed)
-            pair = _register(views, first, second, geometry, seed)
-        if pair is not None:
-            pairs.append(pair)
+        # Most matches on repeated structure may be wrong, so the others are tried as well.
+        tried = (_register(views, first, second, each.matrix) for each in found)
+        registered = next((each for each in tried if each is not None), None)
+        if registered is not None:
+            pairs.append(registered)
             partners[[first, second]] += 1
     return pairs
 
 
 def _register(
-    views: Sequence[_Image], first: int, second: int, geometry: InitialGeometry, seed: int
+    views: Sequence[_Image], first: int, second: int, homography: np.ndarray
 ) -> RegisteredPair | None:
-    """Register a pair by dense matches guided by a geometry; return None if they reject it."""
-    if geometry.matrix is None:
-        return None
+    """Register a pair by dense matches along a homography; None if the images reject it."""
     a, b = views[first], views[second]
-    keypoints = a.keypoints, b.keypoints
-    guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
-    if guide.matrix is None or matches is None or matches.points0 is not None:  # not dense
+    pair = ImagePair((a.gray, b.gray))
+    judge = Judge(pair)
+    matrix = refined(pair, homography)
+    view = judge.along_plane(matrix)
+    still = stands_still(homography, pair.sizes)
+    if not view.confirmed or view.evidence.share < (MIN_STILL if still else MIN_EXPLAINED):
         return None
+    pixels = np.rint(a.keypoints), np.rint(b.keypoints)
+    matches = match_along_plane(pair, pixels, matrix, judge, view.evidence)
     points = a.keypoints[matches.indices0]
+    if len(points) < MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels):
+        return None
     order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
     spread = points[order[:MAX_CORRESPONDENCES]]
-    return RegisteredPair(first, second, guide.matrix, spread, len(points))
+    return RegisteredPair(first, second, matrix, spread, len(points))
 
 
 def _registered_again(
     views: Sequence[_Image],
     to_common: dict[int, np.ndarray],
     pairs: Sequence[RegisteredPair],
-    seed: int,
 ) -> list[RegisteredPair]:
     """Register pairs again, starting from the joint fit, if they disagree with it or are missing.
 
@@ -285,10 +285,7 @@ def _registered_again(
         else:
             good = _disagreement_px(pair, to_common) < MAX_DISAGREEMENT_PX
         if not good:
-            nowhere = np.empty((0, 2))
-            fit = TwoViewModel("homography", matrix, np.zeros(0, bool), 0.0)
-            geometry = InitialGeometry.of(fit, nowhere, nowhere, "homography")
-            again = _register(views, first, second, geometry, seed)
+            again = _register(views, first, second, matrix)
             if again is not None:
                 partners[first].add(second)
                 partners[second].add(first)

@@ -15,7 +15,7 @@ from deepdetect.features.keypoints import nearest_keypoints
 from deepdetect.geometry import transform_points
 from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import load_image, luma
-from deepdetect.matching.guided import guided_matches, guiding_geometry
+from deepdetect.matching.guided import Explanation, ImagePair
 
 from ...datasets.planar import PlanarPair
 from ..baselines.method import LocalFeature
@@ -169,17 +169,16 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
     "points1", (M, 2) each, and the "seconds" of guided matching, without finding keypoints.
     """
     images = (pair.first, pair.second)
-    first, second = (run.keypoints(feature, image)[0].xy for image in images)
+    first, second = (run.keypoints(feature, image)[0] for image in images)
 
     def make() -> Row:
         grays = luma(load_image(pair.first)), luma(load_image(pair.second))
         with profiled() as profile:
-            geometry = guiding_geometry(grays, seed=seed)
-            trusted, found = guided_matches(grays, (first, second), geometry, seed)
+            trusted, found = Explanation(ImagePair(grays), (first, second), seed=seed).answer()
         return {
             "model": trusted.model,
             "matrix": np.empty((0, 3)) if trusted.matrix is None else trusted.matrix,
-            "points0": np.empty((0, 2)) if found is None else found.starts(first),
+            "points0": np.empty((0, 2)) if found is None else found.starts(np.rint(first.xy)),
             "points1": np.empty((0, 2)) if found is None else found.points1,
             "seconds": profile.seconds,
         }

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.matching.guided.asift import simulate_view, simulated_views
+from deepdetect import Keypoints
+from deepdetect.matching.guided.simulated_views import simulate_view, simulated_views
 
 
 def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
@@ -56,9 +57,17 @@ def test_fine_stripes_are_blurred_before_they_are_shortened(tilt: float) -> None
     assert np.ptp(upright[10:-10, 5:-5].astype(int)) == 255  # the height is not touched
 
 
+def spots(view: np.ndarray) -> Keypoints:
+    """Find spots with OpenCV's SIFT."""
+    found = cv2.SIFT_create(100, enable_precise_upscale=True).detect(view, None)
+    return Keypoints.from_opencv(found, view.shape[::-1])
+
+
 def test_keypoints_lie_at_their_positions_in_the_image_itself() -> None:
     """A spot four times wider than high is round in the view without a turn."""
-    _, found = next(simulated_views((blob(110, 70, 12, 3),) * 2, 100))
+    gray = blob(110, 70, 12, 3)
+    side, found = next(simulated_views((gray, gray), spots))
+    assert side == 0
     gaps = found.xy - [110, 70]
     near = gaps[np.argmin(np.linalg.norm(gaps, axis=1))]
     assert abs(near[0]) < 0.6

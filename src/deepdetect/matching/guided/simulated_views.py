@@ -8,8 +8,7 @@ rotations between views.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -18,11 +17,8 @@ import numpy as np
 
 from ..._shared.machine import processor_count
 from ..._shared.opencv import cv2
-from ...detector.point_detector import PointDetector
-from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
-from ...features.learned import LEARNED
-from ...io.image import MINIMUM_SIDE
+from .image_pair import Pair
 
 BLUR = 0.8
 """Sigma of the blur before compression, in pixels per sqrt(tilt^2 - 1), as in the paper."""
@@ -39,32 +35,20 @@ geometry for all 60, a tilt of 3 with five directions for 55, and SIFT with 30 v
 and 4 for 33."""
 
 
-def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
-    """Return keypoints with learned descriptors, or no keypoints if the image is too small."""
-    height, width = gray.shape
-    if min(height, width) < MINIMUM_SIDE:
-        return describe_learned(gray, Keypoints.empty((width, height)))
-    return _detector(max_keypoints).extract(gray)
-
-
-@functools.cache
-def _detector(max_keypoints: int) -> PointDetector:
-    return PointDetector(max_keypoints, descriptor=LEARNED)
-
-
 def simulated_views(
-    grays: tuple[np.ndarray, np.ndarray], max_keypoints: int
+    grays: Pair, find: Callable[[np.ndarray], Keypoints]
 ) -> Iterator[tuple[int, Keypoints]]:
     """Yield the image number (0 or 1) of each simulated view, and its keypoints with descriptors.
 
-    Keypoint positions are those in the original image. Views of the first image come first.
+    `find` returns the keypoints of a view, whose positions are then moved to the original image.
+    Views of the first image come first.
     """
 
     def see(side: int, rotation_deg: float) -> tuple[int, Keypoints]:
         gray = grays[side]
         size = gray.shape[1], gray.shape[0]
         view, to_view = simulate_view(gray, TILT, rotation_deg)
-        keypoints = learned_points(view, max_keypoints)
+        keypoints = find(view)
         back = cv2.invertAffineTransform(to_view)
         xy = keypoints.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
         moved = replace(keypoints, xy=xy, image_size=size)

@@ -1,7 +1,7 @@
 """Dense matches of a scene with depth, by rectification: epipolar lines become rows.
 
 Corresponding rows are matched (`matching.stereo`) over a range of disparities that sparse matches
-and a small copy of the pair give. Each match ends at a sub-pixel position, not at a keypoint.
+give. Each match ends at a sub-pixel position, not at a keypoint.
 
 A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
 are tracked from one view to the other, starting from the matches of the rows, and the matrix is
@@ -35,11 +35,10 @@ from ...geometry.transforms import (
 from ..stereo.matching import (
     DisparityOptions,
     compute_disparity,
-    find_disparity_range,
     range_with_margin,
 )
 from ..stereo.sgm import DisparityRange
-from .tentative_matches import Pair
+from .image_pair import Pair
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """Options for matching rows. The range of disparities is set for each pair."""
@@ -59,19 +58,8 @@ CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
 """Side of the windows in which rectified views are correlated, and sigma of the preceding blur."""
 
 MIN_CORRELATION = 0.3
-"""A match is dropped if the correlation of its windows is below this, unless `FALSE_DISCOVERY_RATE`
-allows a lower correlation."""
-
-FALSE_POSITIVE_RATE = 0.01
-"""Besides `MIN_CORRELATION`, a second minimum of the correlation lets at most this fraction of the
-pixels match by chance, as measured on unrelated rows. Chosen on Oxford and others."""
-
-FALSE_DISCOVERY_RATE = 0.01
-"""Matches below the minimum correlations are kept as well, but geometry does not rely on them, if
-chance explains at most this fraction of all kept matches. Chosen on Oxford and others."""
-
-NULL_FRACTION = 0.25
-"""This fraction of the rows is matched with unrelated rows, to measure chance. Chosen by hand."""
+"""Geometry relies on a match if the correlation of its windows is at least this. With less, it is
+kept if the correlation is above 0: chance gives as many below as above."""
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
 """The images are rectified again if fewer than the second fraction of the tracked corners have
@@ -212,28 +200,12 @@ def rectified_view(
         plane = None if plane is None else scaled_homography(plane, scale, scale)
         return rectified_view((small0, small1), (points0, points1), fundamental, plane, scale)
     (first, valid0), (second, valid1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
-    # A small copy of a polar frame also gives disparities of the wrong sign, so it is not searched.
-    seen = None if isinstance(frame, PolarFrame) else find_disparity_range(first, second)
-    if seen is not None:
-        widened = min(low, seen[0]), max(high, seen[1])
-        # The range of the small copy may be far off, so it must be searchable at this image size.
-        if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
-            low, high = widened
     widest = frame.size[0] - 1
     searched = max(low, -widest), min(high, widest)
     if searched[0] >= searched[1]:
         return None
     disparity, matched, correlation = _match_rows((first, second), (valid0, valid1), searched)
-    # Some rows are matched with unrelated rows of the second view: all these matches are chance.
-    height = len(first)
-    count = max(1, round(height * NULL_FRACTION))
-    rows = (height - count) // 2 + np.arange(count)
-    others = (rows + height // 2) % height
-    unrelated, shown = (first[rows], second[others]), (valid0[rows], valid1[others])
-    _, null, null_correlation = _match_rows(unrelated, shown, searched)
-    pixels, null_pixels = (int(np.count_nonzero(valid)) for valid in (valid0, valid0[rows]))
-    bounds = _correlation_bounds(correlation[matched], pixels, null_correlation[null], null_pixels)
-    relied, kept = (matched & (correlation >= bound) for bound in bounds)
+    kept, relied = (matched & (correlation >= bound) for bound in (0, MIN_CORRELATION))
     disparity = np.where(kept, disparity, np.float32(np.nan))
     views = first, second
     return RectifiedView(frame, scale or 1.0, views, searched, disparity, relied, correlation)
@@ -257,26 +229,6 @@ def _match_rows(
     )
     correlation = np.where(matched, np.nan_to_num(correlation), np.float32(-1))
     return rows.disparity, matched, correlation
-
-
-def _correlation_bounds(
-    correlations: np.ndarray, pixels: int, null: np.ndarray, null_pixels: int
-) -> tuple[float, float]:
-    """Return the minimum correlations of matches that geometry relies on, and of kept matches.
-
-    `correlations` belong to the matches found in `pixels` pixels, `null` to the chance matches
-    found in `null_pixels` pixels.
-    """
-    null = np.sort(null)[::-1]
-    allowed = int(FALSE_POSITIVE_RATE * null_pixels)
-    high = max(MIN_CORRELATION, float(null[allowed]) if len(null) > allowed else -1.0)
-    # Matches of low correlation are credible if chance gives hardly any matches and the pair many.
-    ordered = np.sort(correlations)
-    bounds = np.append(-1.0, null[::-1])
-    matches = len(ordered) - np.searchsorted(ordered, bounds)
-    wrong = (len(null) - np.searchsorted(null[::-1], bounds)) * pixels / max(null_pixels, 1)
-    few = bounds[(wrong <= FALSE_DISCOVERY_RATE * matches) & (null_pixels > 0)]
-    return high, min(high, float(few.min())) if len(few) else high
 
 
 def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:

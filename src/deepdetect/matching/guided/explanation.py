@@ -1,0 +1,384 @@
+"""Explain a pair of images: propose geometries, judge them, take the best, explain the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..._shared.errors import ImageError
+from ...features.keypoints import Keypoints, nearest_keypoints
+from ...features.matches import MAX_KEYPOINT_DISTANCE_PX, GuidedMatches, TwoViewGeometry
+from ...features.matches import Evidence as PublicEvidence
+from ...geometry.camera import Size
+from ...geometry.images import edge_strength
+from ...geometry.lens import UNDISTORT, distortion
+from ...geometry.transforms import outer_corners, transfer_errors
+from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
+from .along_plane import match_along_plane, refined
+from .along_rows import match_by_rectification
+from .image_pair import ImagePair, Pair
+from .judge import Evidence, Judge
+from .parallax import measure_parallax
+from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
+
+MIN_MATCHED_FRACTION = 0.02
+"""Dense matching has failed if it matches less than this fraction of the keypoints."""
+
+MOST = 2 / 3
+"""A scene has depth if a homography explains less than this fraction of the matches that agree with
+a fundamental matrix. The confidence is "high" only if as many of all matches follow one geometry:
+the others lie on what moves differently."""
+
+NEARLY_ALL = 0.9
+"""A plane that explains this fraction of what both images show may explain only half of the
+matches, because those from one period of a pattern to another also lie on epipolar lines."""
+
+MAX_SPARSE_LOG10_NFA = -12.0
+"""Without dense matches, sparse ones are an answer if the log10 number of false alarms is below
+this."""
+
+OFF_RATIO = 4.0
+"""Tentative matches with errors above this multiple of the inlier threshold are not explained."""
+
+MIN_GAIN = 1.05
+"""A plane moves on its own if a fundamental matrix of the rest alone fits this many times as many
+matches of the rest as the matrix of all, and less than a third of those on the plane."""
+
+MAX_STILL = 0.005
+"""Motions of less than this fraction of the longer side may be errors: 3 pixels of 640, the inlier
+threshold of a homography."""
+
+MIN_MOVING = 0.5
+"""What stands still is left out if a geometry that moves explains at least this fraction of as many
+windows: a caption, a part of the vehicle. With less, something moves before a still camera."""
+
+MAX_LAYERS = 4
+"""Maximum number of geometries of one pair: one of the scene, others of what moves on its own."""
+
+HIGH_SHARE, HIGH_LOG10_NFA = 0.2, -12.0
+"""The confidence is "high" only if the images confirm at least this fraction of the compared
+windows, and the log10 number of false alarms is below the second value."""
+
+SCENE_MATCHES, DOMINANT_FRACTION = 1000, 0.5
+"""A plane is dominant if DOMINANT_FRACTION of SCENE_MATCHES random dense matches or more lie on it,
+which makes it the largest part of the scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """What one geometry explains."""
+
+    hypothesis: Hypothesis
+    matches: GuidedMatches
+    evidence: Evidence
+
+    @property
+    def dense(self) -> bool:
+        """Whether the matches are dense."""
+        return self.matches.points0 is None
+
+
+class Explanation:
+    """The layers of a pair, the one that explains most first."""
+
+    def __init__(
+        self,
+        pair: ImagePair,
+        keypoints: tuple[Keypoints, Keypoints],
+        asked: str = "auto",
+        given: Pair | Tentative | None = None,
+        seed: int = 0,
+    ) -> None:
+        self._pair, self._asked, self._seed = pair, asked, seed
+        self.pixels = np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)
+        self._sources = Sources(pair, given, keypoints)
+        self._judges: dict[bool, tuple[ImagePair, Judge]] = {}
+        self.tried = Tentative(np.empty((0, 2)), np.empty((0, 2)))
+        self.best_nfa = np.inf
+        self.refuted = False
+        self.left_out = 0.0
+
+    @cached_property
+    def layers(self) -> list[Layer]:
+        """The layers."""
+        layers: list[Layer] = []
+        fallback: Layer | None = None
+        for tentative in self._sources:
+            self.tried = tentative
+            found = next(self._confirmed(tentative), None)
+            if self.refuted:
+                return []
+            if found is not None and found.dense:
+                layers.append(found)
+                break
+            if found is not None and (
+                fallback is None or found.hypothesis.log10_nfa < fallback.hypothesis.log10_nfa
+            ):
+                fallback, self._sources.hinted = found, True
+        if not layers:
+            return [] if fallback is None else [fallback]
+        free = np.ones(len(tentative.points0), bool)
+        explained = layers[0].evidence.explained
+        if self._asked != "auto":
+            return layers
+        while len(layers) < MAX_LAYERS:
+            last = layers[-1].hypothesis
+            errors = last.errors(tentative.points0, tentative.points1)
+            free &= errors > OFF_RATIO * last.threshold_px
+            further = next(self._confirmed(tentative.chosen(free), ~explained), None)
+            if further is None or not further.dense:
+                break
+            layers.append(further)
+            explained = explained | further.evidence.explained
+        layers.sort(key=lambda layer: -layer.evidence.windows)
+        moving = [
+            layer
+            for layer in layers
+            if layer.hypothesis.model != "homography"
+            or not stands_still(layer.hypothesis.matrix, self._pair.sizes)
+        ]
+        least = MIN_MOVING * layers[0].evidence.windows
+        if moving and moving[0].evidence.windows >= least:
+            self.left_out = float(
+                sum(each.evidence.explained.mean() for each in layers if each not in moving)
+            )
+            return moving
+        return layers
+
+    def _seen(self, cross_modal: bool) -> tuple[ImagePair, Judge]:
+        if cross_modal not in self._judges:
+            pair = self._pair
+            if cross_modal:
+                first, second = (edge_strength(gray) for gray in pair.grays)
+                pair = ImagePair((first, second))
+            self._judges[cross_modal] = pair, Judge(pair)
+        return self._judges[cross_modal]
+
+    def _confirmed(self, tentative: Tentative, free: np.ndarray | None = None) -> Iterator[Layer]:
+        """Yield layers that the images confirm, the best first, then sparse ones."""
+        pair, judge = self._seen(tentative.cross_modal)
+        epipolar, refuted = None, np.zeros(len(tentative.points0), bool)
+        if self._asked != "homography":
+            epipolar = propose(pair, tentative, "fundamental", self._seed)
+        flat: Layer | None = None
+        part: Hypothesis | None = None
+        sparse: list[Hypothesis] = []
+        flats: list[Hypothesis] = []
+        if self._asked != "fundamental":
+            flats = [*planes(pair, tentative, self._seed)]
+        for plane in flats:
+            self.best_nfa = min(self.best_nfa, plane.log10_nfa)
+            view = judge.along_plane(plane.matrix)
+            evidence = self._on_free(view.evidence, free)
+            if not evidence.confirms:
+                sparse.append(plane)
+                continue
+            least = 1 / 2 if evidence.share >= NEARLY_ALL else MOST
+            only_part = epipolar is not None and not _mostly(plane.inliers, epipolar.inliers, least)
+            matrix = plane.matrix
+            if not only_part:
+                matrix = refined(pair, matrix)
+                view = judge.along_plane(matrix)
+                evidence = self._on_free(view.evidence, free)
+            if view.repeated:
+                refuted |= plane.inliers
+                continue
+            if only_part:
+                part = plane
+                break
+            plane = replace(plane, matrix=matrix)
+            matches = match_along_plane(pair, self.pixels, matrix, judge, evidence)
+            if len(matches) >= self._enough:
+                flat = Layer(plane, matches, evidence)
+            break
+        if epipolar is not None and _mostly(refuted, epipolar.inliers, 1 / 2):
+            epipolar = None  # it explains the same pattern
+        if epipolar is not None:
+            epipolar = self._apart(pair, flats, epipolar)
+        if epipolar is not None:
+            self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
+            deep = flat is None or self._is_deep(pair, flat.hypothesis, epipolar)
+            ways = (None, part) if flat is None else (flat.hypothesis,)
+            layer = self._along_rows(pair, judge, epipolar, ways, free) if deep else None
+            if layer is not None:
+                yield layer
+            else:
+                sparse.append(epipolar)
+        if flat is not None:
+            yield flat
+        nothing = free is None and flat is None and epipolar is None
+        self.refuted = nothing and bool(refuted.any())
+        sparse = [each for each in sparse if each.log10_nfa < MAX_SPARSE_LOG10_NFA]
+        if not self.refuted and sparse and free is None:
+            best = min(sparse, key=lambda each: each.log10_nfa)
+            layer = self._sparse(best)
+            if layer is not None:
+                yield layer
+
+    def _apart(
+        self, pair: ImagePair, flats: Sequence[Hypothesis], epipolar: Hypothesis
+    ) -> Hypothesis:
+        """Return the geometry of what is off a plane, if a plane moves on its own."""
+        for plane in flats:
+            tentative = plane.tentative
+            off = plane.errors(tentative.points0, tentative.points1) > 2 * plane.threshold_px
+            rest = propose(pair, tentative.chosen(off), "fundamental", self._seed)
+            if rest is None:
+                continue
+            inliers = np.zeros(len(off), bool)
+            inliers[np.flatnonzero(off)[rest.inliers]] = True
+            along = rest.errors(*plane.points) < 2 * rest.threshold_px
+            gain = np.count_nonzero(inliers) > MIN_GAIN * np.count_nonzero(epipolar.inliers & off)
+            if gain and np.mean(along) < 1 / 3:
+                return replace(rest, inliers=inliers, tentative=tentative)
+        return epipolar
+
+    def _is_deep(self, pair: ImagePair, plane: Hypothesis, epipolar: Hypothesis) -> bool:
+        """Return whether a scene has depth that a plane does not explain."""
+        agreeing = epipolar.tentative.chosen(epipolar.inliers | plane.inliers)
+        ends = agreeing.points0, agreeing.points1
+        return measure_parallax(pair, plane.matrix, ends, self._seed).shows_depth
+
+    def _along_rows(
+        self,
+        pair: ImagePair,
+        judge: Judge,
+        epipolar: Hypothesis,
+        planes: Sequence[Hypothesis | None],
+        free: np.ndarray | None,
+    ) -> Layer | None:
+        """Match along epipolar lines, also in images that a plane makes alike; None if rejected."""
+        count, lattice = len(self.pixels[0]), judge.lattice()
+        everywhere = np.concatenate([self.pixels[0], lattice])
+        for plane in dict.fromkeys(planes):
+            known = None if plane is None else plane.matrix
+            found = match_by_rectification(
+                pair.grays, everywhere, epipolar.points, epipolar.matrix, plane=known
+            )
+            if found is not None and np.count_nonzero(found[1].indices0 < count) >= self._enough:
+                break
+        else:
+            return None
+        matrix, both = found
+        own = both.indices0 < count
+        matches = both.chosen(own)
+        starts = matches.starts(self.pixels[0])
+        # The lattice is judged, so that the answer does not depend on where keypoints are.
+        view = judge.along_matches(everywhere[both.indices0[~own]], both.points1[~own])
+        evidence = self._on_free(view.evidence, free)
+        if not evidence.confirms or view.repeated:
+            return None
+        if free is not None:
+            matches = matches.chosen(evidence.explained[judge.cells_of(starts)])
+        return Layer(replace(epipolar, matrix=matrix), matches, evidence)
+
+    def _sparse(self, hypothesis: Hypothesis) -> Layer | None:
+        points0, points1 = hypothesis.points
+        rows, distances = nearest_keypoints(points0, self.pixels[0], self._pair.sizes[0])
+        rows = np.where(distances <= MAX_KEYPOINT_DISTANCE_PX, rows, -1).astype(np.int64)
+        scores = np.ones(len(rows), np.float32)
+        matches = GuidedMatches(rows, points1, scores, subpixel=True, points0=points0)
+        nowhere = np.zeros((1, 1), bool)
+        nothing = Evidence(np.full((1, 1), np.nan), 1.0, 1.0, nowhere, nowhere)
+        return Layer(hypothesis, matches, nothing) if len(rows) >= MIN_MATCHES else None
+
+    def _on_free(self, evidence: Evidence, free: np.ndarray | None) -> Evidence:
+        if free is None:
+            return evidence
+        return replace(evidence, similarity=np.where(free, evidence.similarity, np.nan))
+
+    @cached_property
+    def _enough(self) -> float:
+        return max(MIN_MATCHED_FRACTION * min(len(xy) for xy in self.pixels), MIN_MATCHES)
+
+    def answer(self) -> tuple[TwoViewGeometry, GuidedMatches | None]:
+        """Return the geometry of the first layer, and the matches of all."""
+        tried = len(self.tried.points0)
+        if not self.layers:
+            evidence = PublicEvidence(tried, 0, self.best_nfa, self.tried.views)
+            return TwoViewGeometry("none", evidence=evidence), None
+        first = self.layers[0]
+        own = first.hypothesis
+        if self._asked != "homography":
+            straight_lines(self._pair, own)
+        matches = first.matches
+        for layer in self.layers[1:]:
+            new = ~np.isin(layer.matches.indices0, matches.indices0)
+            matches = matches.joined(layer.matches, new)
+        starts = matches.starts(self.pixels[0])
+        alike = np.ones(len(matches), bool)
+        if first.dense and own.model == "fundamental":
+            _, judge = self._seen(own.tentative.cross_modal)
+            cells = judge.cells_of(starts)
+            alike = ~first.evidence.contradicted[cells]
+            for layer in self.layers[1:]:
+                alike |= layer.evidence.explained[cells]
+        high = first.dense and first.evidence.share >= HIGH_SHARE
+        high = high and own.log10_nfa < HIGH_LOG10_NFA
+        high = high and len(first.matches) >= MOST * len(matches)
+        evidence = PublicEvidence(
+            len(own.tentative.points0),
+            int(np.count_nonzero(own.inliers)),
+            float(own.log10_nfa),
+            own.tentative.views,
+            verified=first.evidence.share,
+            agreement=first.evidence.agreement,
+            correlation=first.evidence.correlation,
+            left_out=self.left_out,
+        )
+        geometry = TwoViewGeometry(
+            own.model, own.matrix, "none", "high" if high else "fair", evidence
+        )
+        geometry = self._with_scene(geometry, starts, matches.points1)
+        return geometry, replace(matches, alike=alike)
+
+    def _with_scene(
+        self, geometry: TwoViewGeometry, points0: np.ndarray, points1: np.ndarray
+    ) -> TwoViewGeometry:
+        some = np.random.default_rng(self._seed).permutation(len(points0))[:SCENE_MATCHES]
+        ends = points0[some].astype(np.float64), points1[some]
+        if geometry.model == "homography":
+            rotation = is_usual_rotation(*ends, self._pair.sizes)
+            evidence = replace(geometry.evidence, on_plane=len(points0))
+            return replace(geometry, scene="rotation" if rotation else "planar", evidence=evidence)
+        plane = fit_model(
+            *ends,
+            "homography",
+            self._pair.sizes[1],
+            GUIDING_THRESHOLDS_PX["homography"],
+            self._seed,
+        )
+        if plane.matrix is None or np.mean(plane.inliers) < DOMINANT_FRACTION:
+            return replace(geometry, scene="depth")
+        off = (
+            transfer_errors(points0, points1, plane.matrix)
+            > 2 * GUIDING_THRESHOLDS_PX["homography"]
+        )
+        count = int(np.count_nonzero(off))
+        evidence = replace(geometry.evidence, on_plane=len(points0) - count, off_plane=count)
+        return replace(geometry, scene="depth with a dominant plane", evidence=evidence)
+
+
+def stands_still(homography: np.ndarray, sizes: tuple[Size, Size]) -> bool:
+    """Return whether a homography between images of one size moves nothing."""
+    corners = outer_corners(sizes[0])
+    motion = transfer_errors(corners, corners, homography)
+    return sizes[0] == sizes[1] and bool(motion.max() < MAX_STILL * max(sizes[0]))
+
+
+def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
+    """Raise an ImageError if a lens that bends lines fits the matches better than a pinhole."""
+    ends = hypothesis.tentative.points0, hypothesis.tentative.points1
+    if distortion(*ends, hypothesis.inliers, pair.sizes):
+        raise ImageError(
+            "the lens of both images bends straight lines, as that of a fisheye, which no "
+            f"pinhole geometry fits: {UNDISTORT}"
+        )
+
+
+def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
+    """Return whether `some` matches are as many as a fraction of other `inliers`."""
+    return bool(np.count_nonzero(some) >= least * np.count_nonzero(inliers))

@@ -1,0 +1,529 @@
+"""The one judge of geometries: the images agree with a geometry more than with displaced copies.
+
+A geometry warps the second image into the frame of the first. Both are divided into cells. RootSIFT
+descriptors of both images at each cell correlate where they show the same place. A cell is
+explained if its correlation, averaged over its neighbours, is above that of nearly all cells of
+copies that are displaced by a quarter of the image or more.
+
+On repeated patterns (windows, tiles, fences), a copy that is displaced by a period aligns cells as
+well as the correct geometry does. So the copies that correlate best as a whole are compared with
+the geometry, cell by cell. The geometry must explain clearly more cells than each of them. Content
+that recurs one period away in the first image is no evidence for it: where the pattern ends, its
+next period may just be hidden.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..._shared.opencv import cv2
+from ...features.sift import dense_sift, sift_gradient, to_root_sift
+from ...geometry.transforms import (
+    scaled_homography,
+    scaled_points,
+    scaling_matrix,
+    translation_matrix,
+)
+from .image_pair import ImagePair, Pair
+
+SIDE_PX = 480
+"""Images are scaled to this longer side before they are compared, so that cells have one size
+relative to the image. A homography that is off by 3 pixels at 640 still aligns them."""
+
+CELL_PX, SIZES_PX = 4, (2.5, 4.5)
+"""Cells are this many pixels apart and described by keypoints of these diameters, whose descriptors
+cover six times as much. With 3 and 6, edges of small planes are less sharp; with less, darkness
+and fog leave fewer cells."""
+
+DIMENSIONS = 64
+"""Descriptors are reduced to this number of principal components of the first image, which changes
+correlations by less than noise and takes a quarter of the time."""
+
+FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
+"""A cell is explained if fewer than the first fraction of the cells of displaced copies correlate
+as well. It is contradicted if its surroundings do not pass the second: doubting one cell
+needs less evidence than believing it."""
+
+FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
+"""Copies displaced by these fractions of width and height, in both directions, show what chance
+looks like on this pair."""
+
+MIN_PERIOD = 3
+"""Displacements of fewer cells are no copies, because descriptors of aligned images overlap."""
+
+MIN_SIMILARITY, MAX_COPIES, MIN_OVERLAP = 0.4, 4, 0.5
+"""A displaced copy is compared with a geometry if its correlation over the whole image is at least
+the first fraction of the geometry's, and this fraction of the overlap remains. Planes of Oxford
+have copies of up to 0.3, facades of one repeated window 0.6 or more. A lattice has four nearest
+copies."""
+
+MIN_WON, MIN_WON_RATIO = 0.0125, 1.5
+"""A geometry must explain at least the first fraction of its cells clearly better than a copy does,
+and the second value times as many as the copy explains better. On facades with one window that is
+unlike the others, the fraction is 0.03 or more, on a truss 0.017; if all windows are alike, up
+to 0.012 for some copy, and 0.002 without the frames of the images."""
+
+MIN_TIED = 0.5
+"""A copy competes with a geometry if it explains at least this fraction of its cells as well. One
+that explains only the road of a street competes with nothing."""
+
+MIN_STRUCTURE, MIN_GRADIENT = 0.5, 4.0
+"""What has a mean difference of pixels two apart, in grey levels, below the first value in both
+images is flat and not compared. What has more than the second value in both shows more than noise:
+noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
+
+WINDOW_CELLS = 16
+"""Cells in a window of 16 pixels, the unit in which explained parts of the image are counted,
+because adjacent cells share most of their pixels."""
+
+MIN_WINDOWS, MIN_SHARE = 8.0, 0.1
+"""The images confirm a geometry if it explains at least this number of windows, and this fraction
+of what can be compared. Geometries of unrelated photographs explain up to 0.07 of them, correct
+ones of long strips in other light 8 windows or more."""
+
+MIN_WINDOWS_AROUND = 5
+"""The place of a window is predicted if most of the eight windows around it hold matches."""
+
+MARGIN_PX = 9
+"""Cells closer than this to the border of an image, or to what is left out, are not compared: they
+see mostly the border. That two images end at the same place is no evidence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """How well a geometry explains the cells of the first image.
+
+    Attributes:
+        similarity: (rows, columns) correlation of each cell with its place; NaN if unknown.
+        bound: correlation above which a cell is explained.
+        spread: standard deviation of the correlations of unrelated cells.
+        contradicted: (rows, columns) bool, where not even the surroundings of a cell, on average,
+            are more similar than those of unrelated cells.
+        structured: (rows, columns) bool, where both images show more than noise.
+    """
+
+    similarity: np.ndarray
+    bound: float
+    spread: float
+    contradicted: np.ndarray
+    structured: np.ndarray
+
+    @cached_property
+    def explained(self) -> np.ndarray:
+        """(rows, columns) bool, where the geometry explains the image."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.similarity > self.bound)
+
+    @cached_property
+    def believed(self) -> np.ndarray:
+        """(rows, columns) bool, where matches are believed: at the border, as next to it."""
+        side = 2 * (MARGIN_PX // CELL_PX + 1) + 1
+        near = cv2.dilate(self.explained.astype(np.uint8), np.ones((side, side))) > 0
+        return np.where(np.isfinite(self.similarity), self.explained, near)
+
+    @property
+    def windows(self) -> float:
+        """Number of explained windows, beyond those that chance explains."""
+        known = np.isfinite(self.similarity)
+        by_chance = FALSE_POSITIVE_RATE * np.count_nonzero(known)
+        return float((np.count_nonzero(self.explained) - by_chance) / WINDOW_CELLS)
+
+    @property
+    def agreement(self) -> float:
+        """Fraction of the compared cells with structure that are not contradicted."""
+        compared = self.structured & np.isfinite(self.similarity)
+        count = np.count_nonzero(compared)
+        return float(np.count_nonzero(compared & ~self.contradicted) / count) if count else 0.0
+
+    @property
+    def correlation(self) -> float:
+        """Median correlation of the compared cells with structure; 0 without any."""
+        compared = self.similarity[self.structured & np.isfinite(self.similarity)]
+        return float(np.median(compared)) if len(compared) else 0.0
+
+    @property
+    def confirms(self) -> bool:
+        """Whether enough of the image is explained to believe the geometry."""
+        return self.windows >= MIN_WINDOWS and self.share >= MIN_SHARE
+
+    @property
+    def share(self) -> float:
+        """Fraction of the compared cells that are explained."""
+        known = np.count_nonzero(np.isfinite(self.similarity))
+        return np.count_nonzero(self.explained) / known if known else 0.0
+
+
+class Judge:
+    """Judges geometries of one pair of images."""
+
+    def __init__(self, pair: ImagePair) -> None:
+        (self._first, scale0), (self._second, scale1) = (
+            _enlarged(*pair.reduced(side, SIDE_PX)) for side in (0, 1)
+        )
+        self._scales = scale0, scale1
+        self._shown = [
+            _shown(mask, gray.shape)
+            for mask, gray in zip(pair.masks, (self._first, self._second), strict=True)
+        ]
+
+    @cached_property
+    def _described(self) -> tuple[np.ndarray, np.ndarray]:
+        """The principal axes, and the described cells of the first image, (rows, columns, D)."""
+        cells, shape = _describe(self._first)
+        axes = np.linalg.eigh(cells.T @ cells)[1][:, -DIMENSIONS:]
+        return axes, (cells @ axes).reshape(*shape, DIMENSIONS)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+        rows, columns = self._described[1].shape[:2]
+        return rows, columns
+
+    def cells_of(self, points0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows and columns of the cells of (N, 2) points of the first image."""
+        last = np.array(self.shape[::-1]) - 1
+        column, row = (
+            (scaled_points(points0, self._scales[0]) / CELL_PX).astype(int).clip(0, last).T
+        )
+        return row, column
+
+    def lattice(self) -> np.ndarray:
+        """Return (N, 2) float32 positions on whole pixels of the first image, two cells apart."""
+        rows, columns = self.shape
+        x, y = (CELL_PX * (np.arange(0, count, 2) + 0.5) for count in (columns, rows))
+        points = np.dstack(np.meshgrid(x, y)).reshape(-1, 2) / self._scales[0]
+        return np.rint(points).astype(np.float32)
+
+    def along_plane(self, homography: np.ndarray) -> View:
+        """Return the second image as a homography places it in the frame of the first."""
+        matrix, size = scaled_homography(homography, *self._scales), self._first.shape[::-1]
+        nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        valid = cv2.warpPerspective(self._shown[1], matrix, size, flags=nearest) > 0
+        how = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+        return self._view(cv2.warpPerspective(self._second, matrix, size, **how), valid)
+
+    def along_matches(self, points0: np.ndarray, points1: np.ndarray) -> View:
+        """Return the second image as matches place it in the frame of the first.
+
+        The matches *around* each window place it, not those inside it, so it shows the same content
+        only if the matches are correct.
+        """
+        points0, points1 = (
+            scaled_points(points, scale)
+            for points, scale in zip((points0, points1), self._scales, strict=True)
+        )
+        ends, known = _predicted(points0, points1, self._first.shape)
+        height, width = self._second.shape
+        x, y = np.moveaxis(ends, 2, 0)
+        known &= (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+        known &= cv2.remap(self._shown[1], x, y, cv2.INTER_NEAREST) > 0
+        warped = cv2.remap(self._second, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return self._view(warped, known)
+
+    def _view(self, warped: np.ndarray, valid: np.ndarray) -> View:
+        gradients = [_mean_gradient(gray) for gray in (self._first, warped)]
+        valid &= (self._shown[0] > 0) & (np.maximum(*gradients) > MIN_STRUCTURE)
+        axes, cells = self._described
+        return View((self._first, warped), axes, cells, valid, self._shown[0])
+
+
+class View:
+    """The second image in the frame of the first, cell by cell."""
+
+    def __init__(
+        self,
+        images: Pair,
+        axes: np.ndarray,
+        first: np.ndarray,
+        valid: np.ndarray,
+        shown: np.ndarray,
+    ) -> None:
+        self._images, self._axes, self._first = images, axes, first
+        self._pixels, self._shown, self._valid = valid.astype(np.uint8), shown, _at_cells(valid)
+        self._second = self._projected(images[1])
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """How well the geometry explains the image."""
+        rows, columns = self._valid.shape
+        far = [
+            self._displaced(round(sign * x * columns), round(sign * y * rows))
+            for x, y in FAR
+            for sign in (1, -1)
+        ]
+        chance = np.concatenate([each[np.isfinite(each)] for each in far])
+        if len(chance) < WINDOW_CELLS:
+            nowhere = np.zeros(self._valid.shape, bool)
+            return Evidence(np.full(self._valid.shape, np.nan), 1.0, 1.0, nowhere, nowhere)
+        # Copies that happen to be displaced by the period of a pattern are outvoted.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # copies that show nothing
+            bounds = [np.nanquantile(each, 1 - FALSE_POSITIVE_RATE) for each in far]
+        bound = float(np.nanmedian(bounds))
+        own = self._displaced(0, 0)
+        around = [_mean_around(each) for each in (own, *far)]
+        with np.errstate(invalid="ignore"):
+            most = np.nanquantile(np.stack(around[1:]), 1 - CONTRADICTING_RATE)
+            contradicted = np.asarray(around[0] <= most)
+        gradients = [_at_cells(_mean_gradient(gray)) for gray in self._images]
+        structured = np.minimum(*gradients) > MIN_GRADIENT
+        return Evidence(own, bound, float(chance.std()), contradicted, structured)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the images confirm the geometry, and reject its displaced copies."""
+        return self.evidence.confirms and not self.repeated
+
+    @cached_property
+    def repeated(self) -> bool:
+        """Whether a displaced copy explains the image as well as the geometry does."""
+        own = self.evidence.similarity
+        bound, spread = self.evidence.bound, self.evidence.spread
+        everywhere = self._shown
+        for shift in self._similar_shifts():
+            move, field = self._refined(shift)
+            if np.abs(np.median(field, axis=(0, 1))).max() < MIN_PERIOD:
+                continue  # the refinement undid the shift
+            near = _gathered(self._first, self._second, self._valid, field)
+            with np.errstate(invalid="ignore"):
+                tied = self.evidence.explained & (own - near < 2 * spread)
+            if np.count_nonzero(tied) < MIN_TIED / 2 * np.count_nonzero(self.evidence.explained):
+                continue
+            copy = self._moved(self._images[1], self._pixels, move)
+            recurring = np.fmax(
+                *(
+                    self._moved(self._images[0], everywhere, each)
+                    for each in (move, np.linalg.inv(move))
+                )
+            )
+            with np.errstate(invalid="ignore"):
+                known = np.isfinite(own) & np.isfinite(copy)
+                explained = known & (own > bound)
+                won = explained & (own - copy > spread) & ~(recurring > bound)
+                better = np.count_nonzero(known & (copy > bound) & (copy - own > spread))
+                tied = np.count_nonzero(explained & ~(own - copy > spread))
+            lost = better - FALSE_POSITIVE_RATE * np.count_nonzero(known & ~explained)
+            total = np.count_nonzero(explained)
+            if tied < MIN_TIED * total:
+                continue
+            if np.count_nonzero(won) < max(MIN_WON * total, MIN_WON_RATIO * lost):
+                return True
+        return False
+
+    def _moved(self, image: np.ndarray, valid: np.ndarray, move: np.ndarray) -> np.ndarray:
+        """Correlate the first image with another in its frame, moved by a homography of cells."""
+        to_cells = np.array([[1 / CELL_PX, 0, 0], [0, 1 / CELL_PX, 0], [0, 0, 1]])
+        to_cells[:2, 2] = -(CELL_PX // 2) / CELL_PX
+        matrix, size = np.linalg.inv(to_cells) @ move @ to_cells, image.shape[::-1]
+        how = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+        nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        known = cv2.warpPerspective(valid, matrix, size, flags=nearest) > 0
+        cells = self._projected(cv2.warpPerspective(image, matrix, size, **how))
+        return _gathered(self._first, cells, _at_cells(known), np.zeros((*cells.shape[:2], 2)))
+
+    def _projected(self, image: np.ndarray) -> np.ndarray:
+        cells, shape = _describe(image)
+        return (cells @ self._axes).reshape(*shape, DIMENSIONS)
+
+    def _displaced(self, x: int, y: int) -> np.ndarray:
+        field = np.broadcast_to(np.array([x, y], np.float64), (*self._valid.shape, 2))
+        return _gathered(self._first, self._second, self._valid, field)
+
+    def _similar_shifts(self) -> np.ndarray:
+        """Return the displacements (x, y), in cells, at which the images also correlate well."""
+        rows, columns = self._valid.shape
+        size = cv2.getOptimalDFTSize(2 * rows), cv2.getOptimalDFTSize(2 * columns)
+        valid = self._valid.astype(np.float64)
+        some = slice(-24, None)  # enough to find periods
+        first, second = (
+            np.fft.rfft2(cells[..., some], size, axes=(0, 1))
+            for cells in (self._first, self._second * self._valid[..., None])
+        )
+        total = np.fft.irfft2((np.conj(first) * second).sum(axis=2), size)
+        whole, part = np.fft.rfft2(np.ones_like(valid), size), np.fft.rfft2(valid, size)
+        overlap = np.fft.irfft2(np.conj(whole) * part, size)
+        enough = overlap >= MIN_OVERLAP * valid.sum()
+        values = np.where(enough, total / np.maximum(overlap, 1), -1.0)
+        side = 2 * MIN_PERIOD + 1
+        peaks = (cv2.dilate(values, np.ones((side, side))) == values) & enough
+        peaks &= values > MIN_SIMILARITY * values[0, 0]
+        shifts = np.argwhere(peaks)[np.argsort(-values[peaks], kind="stable")]
+        shifts = np.where(shifts > np.array(size) / 2, shifts - size, shifts)[:, ::-1]
+        return shifts[np.abs(shifts).max(axis=1) >= MIN_PERIOD][:MAX_COPIES]
+
+    def _refined(self, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the homography, between positions in cells, of a copy near a shift, and its field.
+
+        In a tilted view, the periods of a pattern are not all alike: the best displacements nearby
+        give a homography.
+        """
+        rows, columns = self._valid.shape
+        y, x = np.indices((rows, columns))
+        here = np.dstack([x, y]).astype(np.float64)
+        field = np.broadcast_to(shift.astype(np.float64), here.shape)
+        result = translation_matrix(*shift)
+        every = slice(None, None, 2)
+        for reach, step in ((4, 2), (2, 1)):
+            around = [
+                (float(i), float(j))
+                for j in range(-reach, reach + 1, step)
+                for i in range(-reach, reach + 1, step)
+            ]
+            near = np.stack(
+                [
+                    _gathered(
+                        self._first[every, every],
+                        self._second,
+                        self._valid,
+                        field[every, every] + each,
+                        here[every, every],
+                    )
+                    for each in around
+                ]
+            )
+            near = np.where(np.isfinite(near), near, -1)
+            good = near.max(axis=0) > self.evidence.bound
+            if np.count_nonzero(good) < 2 * WINDOW_CELLS:
+                return result, field
+            starts = here[every, every][good]
+            ends = starts + field[every, every][good] + np.array(around)[near.argmax(axis=0)[good]]
+            try:
+                matrix, _ = cv2.findHomography(starts, ends, cv2.USAC_MAGSAC, 1.5)
+            except cv2.error:  # for rare orders of the matches
+                return result, field
+            if matrix is None:
+                return result, field
+            mapped = cv2.perspectiveTransform(here.reshape(1, -1, 2), matrix).reshape(here.shape)
+            if not np.abs(np.median(mapped - here - field, axis=(0, 1))).max() <= reach:
+                return result, field
+            field, result = mapped - here, matrix
+        return result, field
+
+
+def _enlarged(gray: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
+    """Enlarge an image whose longer side is below `SIDE_PX`; return it and its new scale."""
+    factor = SIDE_PX / max(gray.shape)
+    if factor <= 1:
+        return gray, scale
+    size = round(gray.shape[1] * factor), round(gray.shape[0] * factor)
+    matrix, how = scaling_matrix(factor)[:2], {"flags": cv2.INTER_CUBIC}
+    enlarged = cv2.warpAffine(gray, matrix, size, borderMode=cv2.BORDER_REPLICATE, **how)
+    return enlarged, scale * factor
+
+
+def _shown(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Return where an image of a shape is not left out, (H, W) uint8."""
+    if mask is None:
+        mask = np.zeros(shape, bool)
+    left = cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
+    side = 2 * MARGIN_PX + 1
+    return cv2.erode(1 - left, np.ones((side, side)), borderValue=0)
+
+
+def _at_cells(mask: np.ndarray) -> np.ndarray:
+    """Return an (H, W) mask at the cells."""
+    return mask[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
+
+
+def _describe(gray: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+    """Return unit descriptors of all cells, (N, D) float32, 0 where nothing is, and their shape."""
+    height, width = gray.shape
+    x, y = (np.arange(CELL_PX // 2, side, CELL_PX) for side in (width, height))
+    pixels = np.dstack(np.meshgrid(x, y)).reshape(-1, 2)
+    gradient, parts = sift_gradient(gray), []
+    for size in SIZES_PX:
+        described = to_root_sift(dense_sift(gray, pixels, size, CELL_PX, gradient))
+        part = described.astype(np.float32)
+        some = part.any(axis=1)
+        part -= part[some].mean(axis=0) if some.any() else 0
+        part /= np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1e-6)
+        part[~some] = 0
+        parts.append(part / np.float32(np.sqrt(len(SIZES_PX))))
+    return np.hstack(parts), (len(y), len(x))
+
+
+def _gathered(
+    first: np.ndarray,
+    second: np.ndarray,
+    valid: np.ndarray,
+    field: np.ndarray,
+    here: np.ndarray | None = None,
+) -> np.ndarray:
+    """Correlate the cells of the first image with displaced ones, averaged over neighbours.
+
+    `field` holds the displacement (x, y) in cells of each cell of `first`, whose positions are
+    `here`. Returns float32, NaN where the displaced cell is not `valid`.
+    """
+    if here is None:
+        y, x = np.indices(field.shape[:2])
+        here = np.dstack([x, y])
+    rows, columns = valid.shape
+    x, y = np.moveaxis(np.rint(np.where(np.isfinite(field), here + field, -1)).astype(int), 2, 0)
+    known = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+    x, y = x.clip(0, columns - 1), y.clip(0, rows - 1)
+    known &= valid[y, x]
+    values = np.einsum("ijk,ijk->ij", first, second[y, x]) * known
+    total, count = (
+        cv2.boxFilter(each, cv2.CV_32F, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for each in (values, known.astype(np.float32))
+    )
+    return np.where(known & (count >= 5), total / np.maximum(count, 1), np.float32(np.nan))
+
+
+def _mean_gradient(gray: np.ndarray) -> np.ndarray:
+    """Return the mean difference of pixels two apart around each pixel."""
+    side = 3 * round(WINDOW_CELLS**0.5) * CELL_PX // 2
+    return cv2.boxFilter(sift_gradient(gray)[0], -1, (side, side))
+
+
+def _mean_around(values: np.ndarray) -> np.ndarray:
+    """Average each cell with those in the windows around its own; NaN stays NaN."""
+    side = 3 * round(WINDOW_CELLS**0.5)
+    known = np.isfinite(values)
+    total, count = (
+        cv2.boxFilter(each, cv2.CV_64F, (side, side), borderType=cv2.BORDER_CONSTANT)
+        for each in (np.where(known, values, 0), known.astype(np.float32))
+    )
+    return np.where(known, total / np.maximum(count, 1e-9), np.nan)
+
+
+def _predicted(
+    points0: np.ndarray, points1: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where affine maps of the matches around each window place its pixels, and where known.
+
+    The places are (H, W, 2) float32.
+    """
+    side = CELL_PX * round(WINDOW_CELLS**0.5)
+    rows, columns = (-(-length // side) for length in shape)
+    last = np.array([columns, rows]) - 1
+    column, row = ((points0 + 0.5) // side).astype(np.int64).clip(0, last).T
+    windows, size = row * columns + column, rows * columns
+
+    def around(own: np.ndarray) -> np.ndarray:
+        own = own.reshape(rows, columns).astype(np.float64)
+        box = cv2.boxFilter(own, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(box - own)
+
+    left = np.column_stack([points0, np.ones(len(points0))])
+    squares, products = (
+        np.array([[around(np.bincount(windows, a * b, size)) for b in right.T] for a in left.T])
+        for right in (left, points1)
+    )
+    known = around(np.bincount(windows, minlength=size) > 0) >= MIN_WINDOWS_AROUND
+    affine = np.zeros((rows, columns, 3, 2))
+    affine[known] = np.linalg.solve(
+        np.moveaxis(squares[..., known], -1, 0), np.moveaxis(products[..., known], -1, 0)
+    )
+    terms = affine.repeat(side, 0).repeat(side, 1)[: shape[0], : shape[1]]
+    y, x = np.indices(shape)
+    ends = terms[..., 0, :] * x[..., None] + terms[..., 1, :] * y[..., None] + terms[..., 2, :]
+    whole = known.repeat(side, 0).repeat(side, 1)[: shape[0], : shape[1]]
+    return ends.astype(np.float32), whole
+
+
+__all__ = ["Evidence", "ImagePair", "Judge", "Pair", "View"]

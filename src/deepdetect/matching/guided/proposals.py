@@ -1,0 +1,308 @@
+"""Hypotheses about the geometry of a pair, from sparse matches of several sources.
+
+A source finds tentative matches; many of them may be wrong. Homographies and a fundamental matrix
+are estimated from them. Sources are asked in turn, the cheapest first, until the images confirm a
+hypothesis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
+
+import numpy as np
+
+from ...detector.point_detector import PointDetector
+from ...detector.points.descriptor import describe_learned
+from ...features.keypoints import Keypoints
+from ...features.learned import CROSS_MODAL, LEARNED, LEARNED_RATIO, is_learned, match_learned
+from ...features.matchers import exact_neighbours, match_descriptors
+from ...geometry.semi_calibrated import estimate_semi_calibrated
+from ...geometry.transforms import epipolar_errors, scaled_points, transfer_errors
+from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model
+from ...io.image import MINIMUM_SIDE
+from .image_pair import ImagePair, Pair
+from .simulated_views import simulated_views
+
+LEARNED_SIDE_PX, LEARNED_KEYPOINTS = 640, 2048
+"""The first source reduces the images to this longer side and finds this number of points in each.
+They give a geometry for all pairs of Oxford but bark 1-6, and for half of the other hard ones."""
+
+DENSE_SIDE_PX, DENSE_KEYPOINTS = 1280, 8192
+"""A later source uses larger images and more points, because that finds twice as many correct
+matches where few are correct."""
+
+GIVEN_SIDE_PX, GIVEN_KEYPOINTS, MIN_POINTS = 1200, 4000, 1000
+"""The caller's points, in images of this side and at most this number of them, are the first source
+if each image has MIN_POINTS of them. Fewer would find less than our own."""
+
+VIEWED_SIDE_PX, VIEWED_KEYPOINTS = 320, 1000
+"""Oblique views are simulated from images of this side with this number of points, and have half
+as many: 16 views then take as long as the source before."""
+
+SEPARATION_PX = 2.0
+"""Only one match per square of this side is kept in each image, in pixels of the reduced images,
+because one corner that is found twice is no further evidence."""
+
+MAX_PLANES = 3
+"""This number of homographies are tried at most, each from the matches that are left. A facade
+that is off by one window in either direction takes two."""
+
+MIN_MATCHES = 8
+"""A geometry needs more matches than the seven that any fundamental matrix fits."""
+
+SEMI_CALIBRATED_MATCHES = 200
+"""A fundamental matrix with fewer matches is also estimated with ordinary cameras, which needs
+fewer correct ones, but not of simulated views: they see one place often, so that their matches are
+not independent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tentative:
+    """Sparse matches of one source.
+
+    Attributes:
+        points0, points1: (M, 2) float64 positions in the images at their own sizes.
+        pixel: pixels of the second image per pixel of the copy in which the matches were found.
+        cross_modal: whether the descriptors are for images of two sensors.
+        views: number of simulated views.
+    """
+
+    points0: np.ndarray
+    points1: np.ndarray
+    pixel: float = 1.0
+    cross_modal: bool = False
+    views: int = 0
+
+    def chosen(self, rows: np.ndarray) -> Tentative:
+        """Return some of the matches."""
+        return replace(self, points0=self.points0[rows], points1=self.points1[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A geometry that tentative matches propose.
+
+    Attributes:
+        model: "homography" or "fundamental".
+        matrix: (3, 3), between the images at their own sizes.
+        inliers: (M,) bool, the tentative matches that agree.
+        log10_nfa: decimal logarithm of the expected number of such geometries among random matches.
+        tentative: the matches.
+    """
+
+    model: str
+    matrix: np.ndarray
+    inliers: np.ndarray
+    log10_nfa: float
+    tentative: Tentative
+
+    @property
+    def points(self) -> Pair:
+        """The matches that agree, (K, 2) in each image."""
+        return self.tentative.points0[self.inliers], self.tentative.points1[self.inliers]
+
+    @property
+    def threshold_px(self) -> float:
+        """Largest error of a match that agrees."""
+        return GUIDING_THRESHOLDS_PX[self.model] * self.tentative.pixel
+
+    def errors(self, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
+        """Return the (N,) errors of matches, in pixels."""
+        return (transfer_errors if self.model == "homography" else epipolar_errors)(
+            points0, points1, self.matrix
+        )
+
+
+class Sources:
+    """Tentative matches of a pair, each source asked only once, and only when it is wanted.
+
+    Attributes:
+        hinted: set it when a source has found a geometry that the images do not yet confirm. More
+            points of the same kind may then help, those of other kinds are left out.
+    """
+
+    def __init__(
+        self,
+        pair: ImagePair,
+        given: Pair | Tentative | None = None,
+        keypoints: tuple[Keypoints, Keypoints] | None = None,
+    ) -> None:
+        self._pair, self._given, self._keypoints = pair, given, keypoints
+        self.hinted = False
+
+    def __iter__(self) -> Iterator[Tentative]:
+        if isinstance(self._given, Tentative):
+            yield self._given
+            return
+        if self._given is not None:
+            yield self._of_positions(self._given)
+        elif self._keypoints is not None:
+            yield from self._of_points(self._keypoints)
+        yield self.learned
+        if not self.hinted:
+            yield self._cross_modal()
+        yield self.dense
+        if not self.hinted:
+            yield self._views()
+
+    @cached_property
+    def learned(self) -> Tentative:
+        """Matches of learned points of small copies."""
+        return self._matched(self._learned_points, LEARNED_SIDE_PX)
+
+    @cached_property
+    def _learned_points(self) -> tuple[Keypoints, Keypoints]:
+        return self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS)
+
+    def _extract(self, side_px: int, keypoints: int) -> tuple[Keypoints, Keypoints]:
+        views, _ = self._pair.both(side_px)
+        with ThreadPoolExecutor(2) as pool:
+            first, second = pool.map(learned_points, views, (keypoints, keypoints))
+        return first, second
+
+    def _matched(
+        self, points: tuple[Keypoints, Keypoints], side_px: int, ratio: float = LEARNED_RATIO
+    ) -> Tentative:
+        (scale0, scale1) = self._pair.both(side_px)[1]
+        points0, points1, _ = matched_points(*points, ratio)
+        ends = scaled_points(points0, 1 / scale0), scaled_points(points1, 1 / scale1)
+        return Tentative(*ends, 1 / scale1)
+
+    def _cross_modal(self) -> Tentative:
+        views, _ = self._pair.both(LEARNED_SIDE_PX)
+        described = [
+            describe_learned(view, points, CROSS_MODAL)
+            for view, points in zip(views, self._learned_points, strict=True)
+        ]
+        found = self._matched((described[0], described[1]), LEARNED_SIDE_PX)
+        return replace(found, cross_modal=True)
+
+    @cached_property
+    def dense(self) -> Tentative:
+        """Matches of many learned points."""
+        return self._matched(self._dense_points, DENSE_SIDE_PX)
+
+    @cached_property
+    def _dense_points(self) -> tuple[Keypoints, Keypoints]:
+        return self._extract(DENSE_SIDE_PX, DENSE_KEYPOINTS)
+
+    def _views(self) -> Tentative:
+        views, (scale0, scale1) = self._pair.both(VIEWED_SIDE_PX)
+        points = self._extract(VIEWED_SIDE_PX, VIEWED_KEYPOINTS)
+        find = partial(learned_points, max_keypoints=VIEWED_KEYPOINTS // 2)
+        found, count = [matched_points(*points), *self._zoomed(points, scale0, scale1)], 0
+        for side, seen in simulated_views(views, find):
+            further = matched_points(seen, points[1 - side])
+            found.append((further[side], further[1 - side], further[2]))
+            count += 1
+        points0, points1, _ = separate(*map(np.concatenate, zip(*found, strict=True)))
+        ends = scaled_points(points0, 1 / scale0), scaled_points(points1, 1 / scale1)
+        return Tentative(*ends, 1 / scale1, views=count)
+
+    def _zoomed(
+        self, points: tuple[Keypoints, Keypoints], scale0: float, scale1: float
+    ) -> Iterator[tuple[np.ndarray, ...]]:
+        """Yield matches of small copies of either image with large copies of the other."""
+        large0, large1 = self._dense_points
+        dense0, dense1 = self._pair.both(DENSE_SIDE_PX)[1]
+        first, second, ratios = matched_points(points[0], large1)
+        yield first, scaled_points(second, scale1 / dense1), ratios
+        first, second, ratios = matched_points(large0, points[1])
+        yield scaled_points(first, scale0 / dense0), second, ratios
+
+    def _of_positions(self, positions: Pair) -> Tentative:
+        scales = [min(1.0, GIVEN_SIDE_PX / max(size)) for size in self._pair.sizes]
+        scaled = [scaled_points(p, s) for p, s in zip(positions, scales, strict=True)]
+        kept = separate(*scaled, np.arange(len(scaled[0])))[2]
+        return Tentative(positions[0][kept], positions[1][kept], 1 / scales[1])
+
+    def _of_points(self, given: tuple[Keypoints, Keypoints]) -> Iterator[Tentative]:
+        few = min(len(each) for each in given) < MIN_POINTS
+        if few or any(each.sizes is None or each.angles is None for each in given):
+            return
+        views, (_, scale1) = self._pair.both(GIVEN_SIDE_PX)
+        first, second = (
+            describe_learned(view, points[:GIVEN_KEYPOINTS])
+            for view, points in zip(views, given, strict=True)
+        )
+        points0, points1, _ = matched_points(first, second)
+        yield Tentative(points0, points1, 1 / scale1)
+
+
+def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
+    """Return keypoints with learned descriptors, or no keypoints if the image is too small."""
+    height, width = gray.shape
+    if min(height, width) < MINIMUM_SIDE:
+        return describe_learned(gray, Keypoints.empty((width, height)))
+    return _detector(max_keypoints).extract(gray)
+
+
+@cache
+def _detector(max_keypoints: int) -> PointDetector:
+    return PointDetector(max_keypoints, descriptor=LEARNED)
+
+
+def matched_points(
+    first: Keypoints, second: Keypoints, ratio: float = LEARNED_RATIO
+) -> tuple[np.ndarray, ...]:
+    """Match keypoints by descriptors; return positions in both images, and distance ratios."""
+    assert first.descriptors is not None
+    assert second.descriptors is not None
+    match = partial(match_descriptors, matcher=exact_neighbours, ratio=ratio, mutual=True)
+    if is_learned(first.descriptor_type):
+        matches = match_learned(first, second, match)
+    else:
+        matches = match(first.descriptors, second.descriptors)
+    points = first.xy[matches.indices0], second.xy[matches.indices1]
+    return separate(*(each.astype(np.float64) for each in points), matches.ratios)
+
+
+def separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Keep only one of several matches that start, or that end, at the same place.
+
+    One corner that is found in many views is no further evidence. The first two arrays are the
+    positions in both images; the other arrays are filtered with them.
+    """
+    for side in (0, 1):
+        cells = np.rint(matches[side] / SEPARATION_PX)
+        _, kept = np.unique(cells, axis=0, return_index=True)
+        kept.sort()
+        matches = tuple(values[kept] for values in matches)
+    return matches
+
+
+def planes(pair: ImagePair, tentative: Tentative, seed: int) -> Iterator[Hypothesis]:
+    """Yield homographies that more matches agree with than chance explains, the best first."""
+    left = np.ones(len(tentative.points0), bool)
+    for _ in range(MAX_PLANES):
+        rows = np.flatnonzero(left)
+        if len(rows) < MIN_MATCHES:
+            return
+        some = tentative.chosen(rows)
+        found = propose(pair, some, "homography", seed)
+        if found is None:
+            return
+        inliers = np.zeros(len(left), bool)
+        inliers[rows[found.inliers]] = True
+        left &= ~inliers
+        yield replace(found, inliers=inliers, tentative=tentative)
+
+
+def propose(pair: ImagePair, tentative: Tentative, model: str, seed: int) -> Hypothesis | None:
+    """Estimate a geometry of tentative matches; return None if chance explains them."""
+    if len(tentative.points0) < MIN_MATCHES:
+        return None
+    ends, size = (tentative.points0, tentative.points1), pair.sizes[1]
+    threshold_px = GUIDING_THRESHOLDS_PX[model] * tentative.pixel
+    found = fit_model(*ends, model, size, threshold_px, seed)
+    few = np.count_nonzero(found.inliers) < SEMI_CALIBRATED_MATCHES
+    if model == "fundamental" and few and not tentative.views:
+        known = estimate_semi_calibrated(*ends, pair.sizes, threshold_px, seed)
+        if known is not None and known.log10_nfa < found.log10_nfa:
+            found = known
+    if found.matrix is None or not found.trusted:
+        return None
+    return Hypothesis(model, found.matrix, found.inliers, found.log10_nfa, tentative)
