@@ -34,7 +34,8 @@ the others lie on what moves differently."""
 
 NEARLY_ALL = 0.9
 """A plane that explains this fraction of what both images show may explain only half of the
-matches, because those from one period of a pattern to another also lie on epipolar lines."""
+matches, because those from one period of a pattern to another also lie on epipolar lines. One that
+explains less may leave out something that stands before it."""
 
 MAX_SPARSE_LOG10_NFA = -12.0
 """Without dense matches, sparse ones are an answer if the log10 number of false alarms is below
@@ -200,7 +201,7 @@ class Explanation:
             epipolar = self._apart(pair, flats, epipolar)
         if epipolar is not None:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
-            deep = flat is None or self._is_deep(pair, flat.hypothesis, epipolar)
+            deep = flat is None or self._is_deep(pair, flat, epipolar)
             ways = (None, part) if flat is None else (flat.hypothesis,)
             layer = self._along_rows(pair, judge, epipolar, ways, free) if deep else None
             if layer is not None:
@@ -226,8 +227,8 @@ class Explanation:
             tentative = plane.tentative
             off = plane.errors(tentative.points0, tentative.points1) > 2 * plane.threshold_px
             rest = propose(pair, tentative.chosen(off), "fundamental", self._seed)
-            if rest is None:
-                continue
+            if rest is None or 3 * np.count_nonzero(rest.inliers) < np.count_nonzero(plane.inliers):
+                continue  # a post before a wall fits to many matrices
             inliers = np.zeros(len(off), bool)
             inliers[np.flatnonzero(off)[rest.inliers]] = True
             along = rest.errors(*plane.points) < 2 * rest.threshold_px
@@ -236,11 +237,13 @@ class Explanation:
                 return replace(rest, inliers=inliers, tentative=tentative)
         return epipolar
 
-    def _is_deep(self, pair: ImagePair, plane: Hypothesis, epipolar: Hypothesis) -> bool:
+    def _is_deep(self, pair: ImagePair, flat: Layer, epipolar: Hypothesis) -> bool:
         """Return whether a scene has depth that a plane does not explain."""
-        agreeing = epipolar.tentative.chosen(epipolar.inliers | plane.inliers)
+        agreeing = epipolar.tentative.chosen(epipolar.inliers | flat.hypothesis.inliers)
         ends = agreeing.points0, agreeing.points1
-        return measure_parallax(pair, plane.matrix, ends, self._seed).shows_depth
+        parallax = measure_parallax(pair, flat.hypothesis.matrix, ends, self._seed)
+        left = flat.evidence.share < NEARLY_ALL
+        return parallax.shows_depth or (left and parallax.shows_foreground)
 
     def _along_rows(
         self,
@@ -302,7 +305,7 @@ class Explanation:
             return TwoViewGeometry("none", evidence=evidence), None
         first = self.layers[0]
         own = first.hypothesis
-        if self._asked != "homography":
+        if self._asked != "homography" and len(self.layers) == 1:  # two motions pass for a lens
             straight_lines(self._pair, own)
         matches = first.matches
         for layer in self.layers[1:]:

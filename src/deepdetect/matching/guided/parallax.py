@@ -38,8 +38,9 @@ agree: a third of the error of tracks for each pixel."""
 
 MIN_ALIGNED, MIN_SHARE, MIN_FAR_SHARE = 0.8, 0.08, 0.02
 """A scene has depth if at least the first fraction of the places off the plane agrees with an
-epipole, and of all places the second fraction is off the plane and agrees, or the third is so by
-more than `FAR` times the noise, as a post before a wall. By chance, 0.16 of the places agree."""
+epipole, and the second fraction of all places is off the plane and agrees. Something stands before
+the plane if the first fraction of what is off by more than `FAR` times the noise agrees, and the
+third fraction of all places is so. By chance, 0.16 of the places agree."""
 
 FAR = 3.0
 
@@ -51,12 +52,13 @@ class Parallax:
     Attributes:
         aligned: fraction of the places off the plane that agree with the best epipole.
         share: fraction of all places that are off the plane and agree with it.
-        far_share: fraction of all places that do so and are clearly off the plane.
+        far_aligned, far_share: the same of the places that are clearly off the plane.
         points0, points1: (N, 2) places in both images, to a fraction of a pixel.
     """
 
     aligned: float
     share: float
+    far_aligned: float
     far_share: float
     points0: np.ndarray
     points1: np.ndarray
@@ -64,8 +66,12 @@ class Parallax:
     @property
     def shows_depth(self) -> bool:
         """Whether the scene has depth."""
-        many = self.share >= MIN_SHARE or self.far_share >= MIN_FAR_SHARE
-        return self.aligned >= MIN_ALIGNED and many
+        return self.aligned >= MIN_ALIGNED and self.share >= MIN_SHARE
+
+    @property
+    def shows_foreground(self) -> bool:
+        """Whether something stands before the plane, or behind it, however small."""
+        return self.far_aligned >= MIN_ALIGNED and self.far_share >= MIN_FAR_SHARE
 
 
 def measure_parallax(
@@ -88,7 +94,7 @@ def measure_parallax(
         for both in ((starts, matched[near]), (starts, ends[near]))
     )
     if not len(starts):
-        return Parallax(0.0, 0.0, 0.0, np.empty((0, 2)), np.empty((0, 2)))
+        return Parallax(0.0, 0.0, 0.0, 0.0, np.empty((0, 2)), np.empty((0, 2)))
     tracked, gaps = track_round_trip(
         equalised, equalise(warped), starts, WINDOW_PX, levels=1, expected=expected
     )
@@ -102,10 +108,17 @@ def measure_parallax(
     points = scaled_points(starts, 1 / scale0), transform_points(tracked, matrix)
     points = points[0], scaled_points(points[1], 1 / scale1)
     if np.count_nonzero(off) < 3:
-        return Parallax(0.0, 0.0, 0.0, *points)
+        return Parallax(0.0, 0.0, 0.0, 0.0, *points)
     agreeing = _agreeing(starts[off], moved[off] / length[off, None], max(first.shape), seed)
-    far = np.count_nonzero(agreeing & (length[off] > FAR * NOISE_PX)) / len(off)
-    return Parallax(agreeing.mean(), agreeing.sum() / len(off), far, *points)
+    far = length[off] > FAR * NOISE_PX
+    clear, clearly_off = (int(np.count_nonzero(each)) for each in (agreeing & far, far))
+    return Parallax(
+        float(agreeing.mean()),
+        float(agreeing.sum() / len(off)),
+        clear / max(clearly_off, 1),
+        clear / len(off),
+        *points,
+    )
 
 
 def _agreeing(places: np.ndarray, directions: np.ndarray, side: int, seed: int) -> np.ndarray:
