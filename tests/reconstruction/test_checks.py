@@ -178,7 +178,7 @@ def test_what_stands_in_front_of_a_plane() -> None:
 
 @pytest.mark.parametrize("wrong", [0, 300])
 def test_a_plane_is_one_also_among_wrong_matches_and_depth_is_none(wrong: int) -> None:
-    """Of 300 matches on a plane up to 100 move further along their rows."""
+    """Up to 100 of 300 matches on a plane move further along their rows."""
     generator = np.random.default_rng(0)
     points0 = generator.uniform(0, 500, (300 + wrong, 2))
     noise = generator.normal(0, 0.3, points0.shape)

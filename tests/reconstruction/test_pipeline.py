@@ -314,7 +314,7 @@ def test_pairs_only_said_to_be_rectified_give_no_cloud(
 
 
 def test_a_pair_taken_in_the_dark_has_depth(level: Any) -> None:
-    """Of a mean of 6 grey levels."""
+    """The images have a mean of 6 grey levels."""
     factor = 6 / level.left.mean()
     dark = [np.rint(view * factor).astype(np.uint8) for view in (level.left, level.right)]
     found = reconstruct(*dark, AllPixels(), calibration=level.calibration, rectified=True)

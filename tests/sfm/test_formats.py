@@ -34,7 +34,7 @@ from ..io.test_gps import place_tags
 
 NAMES, TURNED = ("0003", "0004", "0005", "0006"), "0006"
 METRES_PER_DEGREE = np.array([111_132.95, 78_846.8])
-"""Of latitude and longitude, at 45 degrees north, by WGS 84."""
+"""A degree of latitude and one of longitude have these lengths at 45 degrees north (WGS 84)."""
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +253,7 @@ def test_what_is_seen_through_gaps_is_left_out() -> None:
 
 
 def test_thinned_points_are_even_in_space() -> None:
-    """Of a line whose one half has a hundred times as many points."""
+    """One half of the line has a hundred times as many points as the other."""
     random = np.random.default_rng(0)
     places = np.concatenate([random.uniform(0, 1, 10_000), random.uniform(1, 2, 100)])
     points = np.column_stack([places, np.zeros((len(places), 2))])

@@ -158,7 +158,7 @@ def test_two_depth_maps_fill_eight_pixels_around_the_middle_of_a_surface(stride:
 
 
 def test_small_patches_need_five_depth_maps() -> None:
-    """Of 25 pixels, five apart, a patch must have 15 around its middle."""
+    """A patch must have 15 of the 25 pixels, five apart, around its middle."""
     strip, narrower = slice(80, 91), slice(80, 90)
     assert agreed_by((3, ROWS, strip, NEAR))[40:80, strip].all()
     assert not agreed_by((4, ROWS, narrower, NEAR)).any()

@@ -15,7 +15,7 @@ from deepdetect.sfm.mapping import read_sparse_model
 from deepdetect.sfm.tracks import add_dense_tracks, refine_tracks
 
 SIZE, NORMAL, DISTANCE = (320, 240), np.array([-0.2, 0, 1]), 6.0
-"""Of the plane z = 6 + x / 5."""
+"""The plane z = 6 + x / 5 has this normal and this distance from the camera."""
 
 
 def view(x: float) -> PosedView:
