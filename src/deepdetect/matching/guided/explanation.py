@@ -90,7 +90,7 @@ class Explanation:
         pair: ImagePair,
         keypoints: tuple[Keypoints, Keypoints],
         asked: str = "auto",
-        given: Pair | Tentative | None = None,
+        given: Pair | None = None,
         seed: int = 0,
     ) -> None:
         self._pair, self._asked, self._seed = pair, asked, seed
@@ -154,7 +154,7 @@ class Explanation:
             pair = self._pair
             if cross_modal:
                 first, second = (edge_strength(gray) for gray in pair.grays)
-                pair = ImagePair((first, second))
+                pair = ImagePair((first, second), pair.masks)
             self._judges[cross_modal] = pair, Judge(pair)
         return self._judges[cross_modal]
 

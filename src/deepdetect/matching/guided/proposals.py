@@ -127,16 +127,13 @@ class Sources:
     def __init__(
         self,
         pair: ImagePair,
-        given: Pair | Tentative | None = None,
+        given: Pair | None = None,
         keypoints: tuple[Keypoints, Keypoints] | None = None,
     ) -> None:
         self._pair, self._given, self._keypoints = pair, given, keypoints
         self.hinted = False
 
     def __iter__(self) -> Iterator[Tentative]:
-        if isinstance(self._given, Tentative):
-            yield self._given
-            return
         if self._given is not None:
             yield self._of_positions(self._given)
         elif self._keypoints is not None:
