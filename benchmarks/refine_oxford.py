@@ -4,7 +4,7 @@
 
 Writes OUTPUT/SCENE/H1toKp.refined for homographies that are clearly better than the published ones,
 which are off by up to 26 px, and prints a table. OUTPUT may be OXFORD itself. Lucas-Kanade on the
-warped images (`geometry.homography_refinement`) starts from the published homography and from one
+warped images (`datasets.homography_refinement`) starts from the published homography and from one
 by SIFT and MAGSAC, and the result with the highest correlation is taken. So no detector that the
 benchmark evaluates determines the result.
 """
@@ -21,13 +21,13 @@ from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.progress import progress
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.geometry import GeometryOptions, estimate_geometry, transform_points
-from deepdetect.geometry.homography_refinement import refine_homography
 from deepdetect.geometry.images import (
     WINDOW_PX,
     median_local_zncc,
     warped_zncc,
 )
 from deepdetect.io.image import load_image, luma
+from deepdetect_lab.datasets.homography_refinement import refine_homography
 from deepdetect_lab.datasets.planar import PlanarPair, load_oxford
 from deepdetect_lab.evaluation.metrics.homography import project_visible
 from deepdetect_lab.evaluation.report import Row, Table

@@ -227,6 +227,11 @@ def _scatter(
     return image
 
 
+MAX_ROUND_TRIP_PX = 0.3
+"""A corner is tracked to the second image and back. The track is kept if it ends at less than this
+distance from its start. Chosen by hand."""
+
+
 def track_round_trip(
     first: np.ndarray,
     second: np.ndarray,

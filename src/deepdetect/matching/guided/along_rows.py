@@ -21,8 +21,14 @@ from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
 from ...geometry.camera import Size
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
-from ...geometry.homography_refinement import MAX_ROUND_TRIP_PX
-from ...geometry.images import downscale, equalise, gaussian_blur, local_zncc, track_round_trip
+from ...geometry.images import (
+    MAX_ROUND_TRIP_PX,
+    downscale,
+    equalise,
+    gaussian_blur,
+    local_zncc,
+    track_round_trip,
+)
 from ...geometry.semi_calibrated import refine_fundamental
 from ...geometry.similarity import MAD_STD
 from ...geometry.transforms import (

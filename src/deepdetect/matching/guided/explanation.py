@@ -17,11 +17,11 @@ from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.transforms import outer_corners, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
-from .along_plane import match_along_plane, refined
+from .along_plane import match_along_plane
 from .along_rows import match_by_rectification
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
-from .parallax import measure_parallax
+from .plane_tracks import PlaneTracks
 from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
 
 MIN_MATCHED_FRACTION = 0.02
@@ -164,7 +164,7 @@ class Explanation:
         epipolar, refuted = None, np.zeros(len(tentative.points0), bool)
         if self._asked != "homography":
             epipolar = propose(pair, tentative, "fundamental", self._seed)
-        flat: Layer | None = None
+        flat: tuple[Layer, PlaneTracks] | None = None
         part: Hypothesis | None = None
         sparse: list[Hypothesis] = []
         flats: list[Hypothesis] = []
@@ -172,28 +172,25 @@ class Explanation:
             flats = [*planes(pair, tentative, self._seed)]
         for plane in flats:
             self.best_nfa = min(self.best_nfa, plane.log10_nfa)
-            view = judge.along_plane(plane.matrix)
+            agreeing = plane.inliers if epipolar is None else plane.inliers | epipolar.inliers
+            some = tentative.chosen(agreeing)
+            tracks = PlaneTracks(pair, plane.matrix, (some.points0, some.points1))
+            view = judge.along_plane(tracks.homography)
             evidence = self._on_free(view.evidence, free)
             if not evidence.confirms:
                 sparse.append(plane)
                 continue
-            least = 1 / 2 if evidence.share >= NEARLY_ALL else MOST
-            only_part = epipolar is not None and not _mostly(plane.inliers, epipolar.inliers, least)
-            matrix = plane.matrix
-            if not only_part:
-                matrix = refined(pair, matrix)
-                view = judge.along_plane(matrix)
-                evidence = self._on_free(view.evidence, free)
             if view.repeated:
                 refuted |= plane.inliers
                 continue
-            if only_part:
-                part = plane
+            exact = replace(plane, matrix=tracks.homography)
+            least = 1 / 2 if evidence.share >= NEARLY_ALL else MOST
+            if epipolar is not None and not _mostly(plane.inliers, epipolar.inliers, least):
+                part = exact
                 break
-            plane = replace(plane, matrix=matrix)
-            matches = match_along_plane(pair, self.pixels, matrix, judge, evidence)
+            matches = match_along_plane(pair, self.pixels, exact.matrix, judge, evidence)
             if len(matches) >= self._enough:
-                flat = Layer(plane, matches, evidence)
+                flat = Layer(exact, matches, evidence), tracks
             break
         if epipolar is not None and _mostly(refuted, epipolar.inliers, 1 / 2):
             epipolar = None  # it explains the same pattern
@@ -201,15 +198,15 @@ class Explanation:
             epipolar = self._apart(pair, flats, epipolar)
         if epipolar is not None:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
-            deep = flat is None or self._is_deep(pair, flat, epipolar)
-            ways = (None, part) if flat is None else (flat.hypothesis,)
+            deep = flat is None or _is_deep(*flat, self._seed)
+            ways = (None, part) if flat is None else (flat[0].hypothesis,)
             layer = self._along_rows(pair, judge, epipolar, ways, free) if deep else None
             if layer is not None:
                 yield layer
             else:
                 sparse.append(epipolar)
         if flat is not None:
-            yield flat
+            yield flat[0]
         nothing = free is None and flat is None and epipolar is None
         self.refuted = nothing and bool(refuted.any())
         sparse = [each for each in sparse if each.log10_nfa < MAX_SPARSE_LOG10_NFA]
@@ -236,14 +233,6 @@ class Explanation:
             if gain and np.mean(along) < 1 / 3:
                 return replace(rest, inliers=inliers, tentative=tentative)
         return epipolar
-
-    def _is_deep(self, pair: ImagePair, flat: Layer, epipolar: Hypothesis) -> bool:
-        """Return whether a scene has depth that a plane does not explain."""
-        agreeing = epipolar.tentative.chosen(epipolar.inliers | flat.hypothesis.inliers)
-        ends = agreeing.points0, agreeing.points1
-        parallax = measure_parallax(pair, flat.hypothesis.matrix, ends, self._seed)
-        left = flat.evidence.share < NEARLY_ALL
-        return parallax.shows_depth or (left and parallax.shows_foreground)
 
     def _along_rows(
         self,
@@ -380,6 +369,13 @@ def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
             "the lens of both images bends straight lines, as that of a fisheye, which no "
             f"pinhole geometry fits: {UNDISTORT}"
         )
+
+
+def _is_deep(flat: Layer, tracks: PlaneTracks, seed: int) -> bool:
+    """Return whether a scene has depth that a plane does not explain."""
+    parallax = tracks.parallax(seed)
+    left = flat.evidence.share < NEARLY_ALL
+    return parallax.shows_depth or (left and parallax.shows_foreground)
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:

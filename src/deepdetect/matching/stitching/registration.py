@@ -27,9 +27,10 @@ from ...geometry.transforms import scaled_points, transfer_errors, transform_poi
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 from ...io.image import luma
 from ..guided import ImagePair, Tentative
-from ..guided.along_plane import match_along_plane, refined
+from ..guided.along_plane import match_along_plane
 from ..guided.explanation import MIN_MATCHED_FRACTION, stands_still, straight_lines
 from ..guided.judge import Judge
+from ..guided.plane_tracks import PlaneTracks
 from ..guided.proposals import (
     LEARNED_KEYPOINTS,
     LEARNED_SIDE_PX,
@@ -241,7 +242,7 @@ def _register(
     a, b = views[first], views[second]
     pair = ImagePair((a.gray, b.gray))
     judge = Judge(pair)
-    matrix = refined(pair, homography)
+    matrix = PlaneTracks(pair, homography).homography
     view = judge.along_plane(matrix)
     still = stands_still(homography, pair.sizes)
     if not view.confirmed or view.evidence.share < (MIN_STILL if still else MIN_EXPLAINED):

@@ -15,9 +15,11 @@ from functools import partial
 
 import numpy as np
 
-from .._shared.opencv import cv2
-from .images import (
+from deepdetect._shared.opencv import cv2
+from deepdetect.geometry.homography_fit import fit_homography_irls
+from deepdetect.geometry.images import (
     BLUR_SIGMA_PX,
+    MAX_ROUND_TRIP_PX,
     WINDOW_PX,
     downscale,
     equalise,
@@ -28,7 +30,7 @@ from .images import (
     track_round_trip,
     warp_to_reference,
 )
-from .transforms import scaled_homography, transform_points
+from deepdetect.geometry.transforms import scaled_homography
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
 """Each round has a side of the tracked windows in pixels, a maximum number of corners, and a number
@@ -40,13 +42,6 @@ MIN_TRACKS = 15
 TRACKING_ITERATIONS, TRACKING_STEP_PX = 15, 0.02
 """Maximum number of steps that track a corner. It has converged when a step moves it by less than
 the second value. Chosen by hand."""
-
-MAX_ROUND_TRIP_PX = 0.3
-"""A corner is tracked to the second image and back. The track is kept if it ends at less than this
-distance from its start. Chosen by hand."""
-
-CAUCHY_SCALE_PX, IRLS_ITERATIONS = 1.0, 30
-"""A track with this residual has half the weight of one without residual. Chosen by hand."""
 
 ALIGNMENT_SIDE_PX, ALIGNMENT_SIGMA_PX, ALIGNMENT_ITERATIONS = 480, 1.0, 15
 """Images are reduced to this longer side and blurred with this sigma before their pixels are
@@ -161,42 +156,6 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
         return scaled_homography(correction.astype(np.float64), 1 / scale, 1 / scale)
 
     return align
-
-
-def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
-    """Fit a homography to (N, 2) points by iteratively reweighted least squares (Cauchy weights).
-
-    Returns None if the points determine no homography. The last element of the result is 1.
-    """
-    middle = points0.mean(axis=0)
-    spread = float(np.abs(points0 - middle).mean())
-    if not spread > 0:
-        return None
-    inwards = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, spread]]) / spread
-    first, second = ((points - middle) / spread for points in (points0, points1))
-    homography = np.eye(3)
-    for _ in range(IRLS_ITERATIONS):
-        depth = first @ homography[2, :2] + 1
-        mapped = transform_points(first, homography)
-        gaps = second - mapped
-        weight = 1 / (1 + (gaps**2).sum(axis=1) * (spread / CAUCHY_SCALE_PX) ** 2)
-        position = np.column_stack([first, np.ones(len(first))]) / depth[:, None]
-        zeros = np.zeros_like(position)
-        across = np.column_stack([position, zeros, -mapped[:, :1] * position[:, :2]])
-        down = np.column_stack([zeros, position, -mapped[:, 1:] * position[:, :2]])
-        normal = (across.T * weight) @ across + (down.T * weight) @ down
-        right = (across.T * weight) @ gaps[:, 0] + (down.T * weight) @ gaps[:, 1]
-        try:
-            step = np.linalg.solve(normal, right)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.isfinite(step).all():
-            return None
-        homography = homography + np.append(step, 0).reshape(3, 3)
-        if np.abs(step).max() < 1e-9:
-            break
-    homography = np.linalg.inv(inwards) @ homography @ inwards
-    return homography / homography[2, 2]
 
 
 def _halves(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
