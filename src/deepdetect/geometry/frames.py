@@ -69,9 +69,13 @@ def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
 def _convex_hull(region: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the convex hull of a region as (H, W) bool, and whether its outline is smooth."""
     hull, outline = np.zeros_like(region), np.zeros_like(region)
-    if (points := cv2.findNonZero(region)) is None:
+    rows = np.flatnonzero(region.any(axis=1))
+    if not len(rows):
         return hull > 0, False
-    corners = cv2.convexHull(points)
+    first = region[rows].argmax(axis=1)
+    last = region.shape[1] - 1 - region[rows, ::-1].argmax(axis=1)
+    ends = np.concatenate([np.column_stack([first, rows]), np.column_stack([last, rows])])
+    corners = cv2.convexHull(ends.astype(np.int32))
     cv2.fillConvexPoly(hull, corners, 1)
     cv2.polylines(outline, [corners], True, 1)
     inner = outline[1:-1, 1:-1] > 0

@@ -16,7 +16,8 @@ import numpy as np
 from .._shared.opencv import cv2
 from ..features.selection import check_ignore
 from ..geometry.frames import FRAME_MARGIN_PX, filled_smoothly, uniform_frame, widened
-from ..geometry.images import BLUR_SIGMA_PX, downscale, gaussian_blur
+from ..geometry.images import BLUR_SIGMA_PX, gaussian_blur
+from ..geometry.transforms import scaled_points
 from ..io.image import luma
 from .guided import ImagePair, Pair, Sources
 from .guided.proposals import propose
@@ -58,21 +59,21 @@ MIN_COMMON = 0.95
 
 def scene_of(
     images: Pair, masks: Sequence[np.ndarray | None], seed: int = 0
-) -> tuple[Pair, list[np.ndarray | None], float]:
+) -> tuple[ImagePair, float]:
     """Leave out the frames of two (H, W, 3) images, and what stands still while the scene moves.
 
-    Returns both images as luma, in which these places are filled smoothly; the ignore `masks`,
+    Returns both images as luma, in which these places are filled smoothly, with the ignore `masks`,
     enlarged by them; and the share of the image that stands still, of which a warning tells.
     """
     left = [uniform_frame(image) for image in images]
-    grays = [filled_smoothly(luma(each), mask) for each, mask in zip(images, left, strict=True)]
-    share = 0.0
-    if grays[0].shape == grays[1].shape:
-        overlay = find_overlay(grays, seed)
-        grays, left = (
-            [filled_smoothly(gray, overlay) for gray in grays],
-            [m | overlay for m in left],
-        )
+    first, second = (filled_smoothly(luma(each), m) for each, m in zip(images, left, strict=True))
+    pair, share = ImagePair((first, second)), 0.0
+    if first.shape == second.shape:
+        overlay = _overlay_of([pair], seed)
+        if overlay.any():
+            left = [mask | overlay for mask in left]
+            first, second = (filled_smoothly(gray, overlay) for gray in pair.grays)
+            pair = ImagePair((first, second))
         both = left[0] & left[1]
         alike = np.count_nonzero(both) >= MIN_COMMON * np.count_nonzero(left[0] | left[1])
         share = float((both if alike else overlay).mean())
@@ -81,7 +82,7 @@ def scene_of(
         mask if not new.any() else new if mask is None else new | check_ignore(mask, new.shape)
         for mask, new in zip(masks, left, strict=True)
     ]
-    return (grays[0], grays[1]), ignored, share
+    return pair.masked(ignored), share
 
 
 def tell_still(share: float) -> None:
@@ -102,14 +103,17 @@ def find_overlay(grays: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:
     """
     if len({gray.shape for gray in grays}) > 1 or len(grays) < 2:
         return np.zeros(grays[0].shape, bool)
-    small = [downscale(gray, COMPARED_SIDE_PX)[0] for gray in grays]
-    pairs = [*itertools.pairwise(small)]
-    still = np.all([_same(*pair) for pair in (*pairs, (small[0], small[-1]))], axis=0)
+    return _overlay_of([ImagePair(pair) for pair in itertools.pairwise(grays)], seed)
+
+
+def _overlay_of(pairs: Sequence[ImagePair], seed: int) -> np.ndarray:
+    small = [pair.both(COMPARED_SIDE_PX)[0] for pair in pairs]
+    compared = small if len(small) == 1 else [*small, (small[0][0], small[-1][1])]
+    still = np.all([_same(*both) for both in compared], axis=0)
     found = np.zeros(still.shape, bool)
     for pair in pairs if np.count_nonzero(still) >= MIN_AREA_PX else ():
         found |= _contradicted(still, pair, seed)
-    size = grays[0].shape[::-1]
-    whole = cv2.resize(np.uint8(found), size, interpolation=cv2.INTER_NEAREST)
+    whole = cv2.resize(np.uint8(found), pairs[0].sizes[0], interpolation=cv2.INTER_NEAREST)
     return widened(whole, FRAME_MARGIN_PX)
 
 
@@ -131,9 +135,10 @@ def _same(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.asarray((difference < MAX_DIFFERENCE * both) & (both > MIN_GRADIENTS))
 
 
-def _contradicted(still: np.ndarray, pair: Pair, seed: int) -> np.ndarray:
+def _contradicted(still: np.ndarray, images: ImagePair, seed: int) -> np.ndarray:
     """Return the regions of still places that the motion between two reduced images contradicts."""
     size = still.shape[::-1]
+    pair, (scale, _) = images.both(COMPARED_SIDE_PX)
     _, labels = cv2.connectedComponents(np.uint8(widened(still, FRAME_MARGIN_PX)))
     shift, known = _shifts(*pair)
 
@@ -148,13 +153,13 @@ def _contradicted(still: np.ndarray, pair: Pair, seed: int) -> np.ndarray:
 
     if not stands(still & known).any():  # before the matching, which takes longest
         return np.zeros(still.shape, bool)
-    both = ImagePair(pair)
-    tentative = Sources(both).learned
-    motion = tentative.points1 - tentative.points0
+    tentative = Sources(images).learned
+    places, ends = (scaled_points(p, scale) for p in (tentative.points0, tentative.points1))
+    motion = ends - places
     moves = np.linalg.norm(motion, axis=1) > MAX_STILL_PX
-    standing, scene, motion = tentative.points0[~moves], tentative.points0[moves], motion[moves]
+    standing, scene, motion = places[~moves], places[moves], motion[moves]
     proposed = (
-        propose(both, tentative.chosen(moves), model, seed)
+        propose(images, tentative.chosen(moves), model, seed)
         for model in ("homography", "fundamental")
     )
     found = min(filter(None, proposed), key=lambda each: each.log10_nfa, default=None)

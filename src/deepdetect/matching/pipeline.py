@@ -107,7 +107,8 @@ def match_images(
     rgb, masks = load_pair((image0, image1), channels, ignore)
     if model != "homography":
         _require_pinholes((image0, image1), rgb, rim=False)
-    grays, masks, left_out = scene_of(rgb, masks, seed)
+    pair, left_out = scene_of(rgb, masks, seed)
+    masks = pair.masks
     timer = StageTimer(progress)
     with timer.stage("keypoints"):
         keypoints0, keypoints1 = (
@@ -115,7 +116,6 @@ def match_images(
             for image, mask in zip(rgb, masks, strict=True)
         )
     settings = guiding, model, seed, options, timer
-    pair = ImagePair(grays, masks)
     matches = _match_guided(pair, (keypoints0, keypoints1), given, *settings)
     matches = _noted(_unmasked(matches, masks), left_out)
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):

@@ -115,7 +115,8 @@ def reconstruct(
     check_model("fundamental", seed, GeometryOptions())
     images = image0, image1
     rgb, masks, _, known = _load_pair(images, channels, calibration, focal_px, ignore)
-    grays, masks, left_out = scene_of(rgb, masks, seed)
+    pair, left_out = scene_of(rgb, masks, seed)
+    grays, masks = pair.grays, pair.masks
     timer = StageTimer(progress)
     rectification = None
     if rectified is None:
@@ -144,7 +145,7 @@ def reconstruct(
                 rgb[1],
                 detector,
                 selection=whole,
-                ignore=masks,
+                ignore=tuple(masks),
                 # A homography would keep only the points on one plane.
                 model="fundamental",
                 seed=seed,

@@ -22,7 +22,7 @@ from .along_rows import match_by_rectification
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
 from .plane_tracks import PlaneTracks
-from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
+from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose, propose_scene
 
 MIN_MATCHED_FRACTION = 0.02
 """Dense matching has failed if it matches less than this fraction of the keypoints."""
@@ -163,7 +163,7 @@ class Explanation:
         pair, judge = self._seen(tentative.cross_modal)
         epipolar, refuted = None, np.zeros(len(tentative.points0), bool)
         if self._asked != "homography":
-            epipolar = propose(pair, tentative, "fundamental", self._seed)
+            epipolar = propose_scene(pair, tentative, self._seed)
         flat: tuple[Layer, PlaneTracks] | None = None
         part: Hypothesis | None = None
         sparse: list[Hypothesis] = []

@@ -1,9 +1,10 @@
-"""A pair of images, of which each reduced copy is made only once."""
+"""A pair of images, of which everything is made only once."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from ...geometry.images import downscale
 
 Pair = tuple[np.ndarray, np.ndarray]
 """Two arrays, one per image: images, (H, W) uint8 luma, or positions of matches, (M, 2) each."""
+
+T = TypeVar("T")
 
 
 class ImagePair:
@@ -23,7 +26,7 @@ class ImagePair:
 
     def __init__(self, grays: Pair, masks: Sequence[np.ndarray | None] = (None, None)) -> None:
         self.grays, self.masks = grays, masks
-        self._reduced: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
+        self._made: list[dict[Hashable, object]] = [{}, {}]
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -34,15 +37,26 @@ class ImagePair:
     def swapped(self) -> ImagePair:
         """Return the pair in the opposite order."""
         other = ImagePair(self.grays[::-1], self.masks[::-1])
-        other._reduced = {(1 - side, most): each for (side, most), each in self._reduced.items()}
+        other._made = self._made[::-1]
         return other
+
+    def masked(self, masks: Sequence[np.ndarray | None]) -> ImagePair:
+        """Return the same images with other masks."""
+        other = ImagePair(self.grays, masks)
+        other._made = self._made
+        return other
+
+    def once(self, side: int, key: Hashable, make: Callable[[], T]) -> T:
+        """Return what `make` makes of image number `side`; it is called once for each `key`."""
+        made = self._made[side]
+        if key not in made:
+            made[key] = make()
+        return made[key]  # type: ignore[return-value]
 
     def reduced(self, side: int, max_side_px: int) -> tuple[np.ndarray, float]:
         """Return image number `side`, its longer side reduced to `max_side_px`, and its scale."""
-        key = side, max_side_px
-        if key not in self._reduced:
-            self._reduced[key] = downscale(self.grays[side], max_side_px)
-        return self._reduced[key]
+        key = "reduced", max_side_px
+        return self.once(side, key, lambda: downscale(self.grays[side], max_side_px))
 
     def both(self, max_side_px: int) -> tuple[Pair, tuple[float, float]]:
         """Return both images, reduced like `reduced`, and their scales."""

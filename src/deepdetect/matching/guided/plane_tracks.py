@@ -119,7 +119,7 @@ class PlaneTracks:
             if found is None:
                 return False
             gain += np.count_nonzero(_on_plane(transform_points(starts, found), ends) & ~used)
-        return gain >= 0
+        return bool(gain >= 0)
 
     @cached_property
     def _moved(self) -> tuple[np.ndarray, np.ndarray]:

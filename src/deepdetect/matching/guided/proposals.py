@@ -54,9 +54,9 @@ MIN_MATCHES = 8
 """A geometry needs more matches than the seven that any fundamental matrix fits."""
 
 SEMI_CALIBRATED_MATCHES = 200
-"""A fundamental matrix with fewer matches is also estimated with ordinary cameras, which needs
-fewer correct ones, but not of simulated views: they see one place often, so that their matches are
-not independent."""
+"""The fundamental matrix of a scene with fewer matches is also estimated with ordinary cameras,
+which needs fewer correct ones, but not of simulated views: they see one place often, so that their
+matches are not independent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,9 +155,14 @@ class Sources:
         return self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS)
 
     def _extract(self, side_px: int, keypoints: int) -> tuple[Keypoints, Keypoints]:
-        views, _ = self._pair.both(side_px)
+        pair = self._pair
+
+        def extract(side: int) -> Keypoints:
+            gray = pair.reduced(side, side_px)[0]
+            return pair.once(side, (side_px, keypoints), lambda: learned_points(gray, keypoints))
+
         with ThreadPoolExecutor(2) as pool:
-            first, second = pool.map(learned_points, views, (keypoints, keypoints))
+            first, second = pool.map(extract, (0, 1))
         return first, second
 
     def _matched(
@@ -288,6 +293,22 @@ def planes(pair: ImagePair, tentative: Tentative, seed: int) -> Iterator[Hypothe
         yield replace(found, inliers=inliers, tentative=tentative)
 
 
+def propose_scene(pair: ImagePair, tentative: Tentative, seed: int) -> Hypothesis | None:
+    """Estimate the fundamental matrix of a scene, also by ordinary cameras if it has few matches."""
+    found = propose(pair, tentative, "fundamental", seed)
+    few = found is None or np.count_nonzero(found.inliers) < SEMI_CALIBRATED_MATCHES
+    if not few or tentative.views or len(tentative.points0) < MIN_MATCHES:
+        return found
+    threshold_px = GUIDING_THRESHOLDS_PX["fundamental"] * tentative.pixel
+    ends = tentative.points0, tentative.points1
+    known = estimate_semi_calibrated(*ends, pair.sizes, threshold_px, seed)
+    if known is None or known.matrix is None or not known.trusted:
+        return found
+    if found is not None and found.log10_nfa <= known.log10_nfa:
+        return found
+    return Hypothesis("fundamental", known.matrix, known.inliers, known.log10_nfa, tentative)
+
+
 def propose(pair: ImagePair, tentative: Tentative, model: str, seed: int) -> Hypothesis | None:
     """Estimate a geometry of tentative matches; return None if chance explains them."""
     if len(tentative.points0) < MIN_MATCHES:
@@ -295,11 +316,6 @@ def propose(pair: ImagePair, tentative: Tentative, model: str, seed: int) -> Hyp
     ends, size = (tentative.points0, tentative.points1), pair.sizes[1]
     threshold_px = GUIDING_THRESHOLDS_PX[model] * tentative.pixel
     found = fit_model(*ends, model, size, threshold_px, seed)
-    few = np.count_nonzero(found.inliers) < SEMI_CALIBRATED_MATCHES
-    if model == "fundamental" and few and not tentative.views:
-        known = estimate_semi_calibrated(*ends, pair.sizes, threshold_px, seed)
-        if known is not None and known.log10_nfa < found.log10_nfa:
-            found = known
     if found.matrix is None or not found.trusted:
         return None
     return Hypothesis(model, found.matrix, found.inliers, found.log10_nfa, tentative)

@@ -26,16 +26,24 @@ def census_rows(first, last, padded, out):  # type: ignore[no-untyped-def]
     """
     height, width = out.shape
     radius_y, radius_x = (padded.shape[0] - height) // 2, (padded.shape[1] - width) // 2
+    side = 2 * radius_x + 1
+    middle = radius_y * side + radius_x
+    bits = (2 * radius_y + 1) * side - 1
+    part = np.empty(width, np.uint8)
     for y in range(first, last):
         out[y] = 0
-        for j in range(-radius_y, radius_y + 1):
-            for i in range(-radius_x, radius_x + 1):
-                if i == 0 and j == 0:
-                    continue
+        here = padded[y + radius_y, radius_x:]
+        for start in range(0, bits, 8):  # vectors hold more bytes than words
+            end = min(start + 8, bits)
+            part[:] = 0
+            for bit in range(start, end):
+                place = bit + 1 if bit >= middle else bit
+                neighbour = padded[y + place // side, place % side :]
                 for x in range(width):
-                    here = padded[y + radius_y, x + radius_x]
-                    darker = padded[y + radius_y + j, x + radius_x + i] < here
-                    out[y, x] = (out[y, x] << np.uint64(1)) | np.uint64(darker)
+                    darker = neighbour[x] < here[x]
+                    part[x] = np.uint8(part[x] << np.uint8(1)) | np.uint8(darker)
+            for x in range(width):
+                out[y, x] = (out[y, x] << np.uint64(end - start)) | np.uint64(part[x])
 
 
 @compiled(nogil=True, inline="always")
@@ -164,7 +172,7 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
     """
     width = total.shape[1]
     best = np.empty(width, np.int64)
-    keys = np.empty(width, np.uint32)
+    keys = np.empty(width, np.uint32)  # of the mirrored right row, as in `_distances`
     for y in range(first, last):
         keys[:] = np.uint32(0xFFFFFFFF)
         for x in range(width):
@@ -172,16 +180,25 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
             # Disparities that lead inside the right image: 0 <= x - min_disparity - d < width.
             low = min(max(0, x - min_disparity - width + 1), count)
             high = max(min(count, x - min_disparity + 1), low)
-            least = inside = np.uint16(65535)
-            for d in range(low, high):
-                inside = min(inside, sums[d])
-            for d in range(count):
+            own = keys[width - 1 - x + min_disparity + low :]
+            first_inside = np.uint32(0xFFFFFFFF)
+            for d in range(high - low):
+                key = (np.uint32(sums[low + d]) << np.uint32(16)) | np.uint32(low + d)
+                own[d] = min(own[d], key)
+                first_inside = min(first_inside, key)
+            inside = least = np.uint16(first_inside >> np.uint32(16))
+            for d in range(low):
+                least = min(least, sums[d])
+            for d in range(high, count):
                 least = min(least, sums[d])
             # A match inside is preferred to one outside with the same cost.
             seen = low < high and inside == least
-            at = low if seen else 0
-            while sums[at] != least:
-                at += 1
+            at = 0
+            if seen:
+                at = np.int64(first_inside & np.uint32(0xFFFF))
+            else:
+                while sums[at] != least:
+                    at += 1
             best[x] = at
             consistent[y, x] = seen
             uniqueness_ratio[y, x] = np.float32(1)
@@ -200,12 +217,10 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
                     if bend > 0:
                         fraction = np.float32(0.5 * (before - after) / bend)
             disparity[y, x] = np.float32(at + min_disparity) + fraction
-            for d in range(low, high):
-                key = (np.uint32(sums[d]) << np.uint32(16)) | np.uint32(d)
-                keys[x - min_disparity - d] = min(keys[x - min_disparity - d], key)
         for x in range(width):
             if consistent[y, x]:
-                from_right = np.int64(keys[x - min_disparity - best[x]] & np.uint32(0xFFFF))
+                at = width - 1 - x + min_disparity + best[x]
+                from_right = np.int64(keys[at] & np.uint32(0xFFFF))
                 consistent[y, x] = abs(from_right - best[x]) <= 1
 
 
