@@ -36,7 +36,6 @@ from ...geometry.transforms import (
     scaled_fundamental,
     scaled_homography,
     scaled_points,
-    transfer_errors,
 )
 from ..stereo.matching import (
     DisparityOptions,
@@ -87,10 +86,6 @@ MAX_TRACK_PX = 4.0
 MIN_TRACKS = 50
 """A pair with fewer tracked corners gets no dense matches. Chosen on Oxford and others."""
 
-NEAR_PLANE_FRACTION = 0.8
-"""If too few corners can be tracked, the disparity range is reduced to that of this fraction of the
-sparse matches, those nearest to a known plane. Content far in front of the plane is then lost."""
-
 MAX_DISAGREEMENT_PX = 3.0
 """A sparse match agrees with the disparity at its start if its own differs by less than this. The
 limit is loose, because sparse matches come from another scale. Chosen on Oxford and others."""
@@ -98,6 +93,12 @@ limit is loose, because sparse matches come from another scale. Chosen on Oxford
 MIN_AGREEMENT = 0.6
 """This fraction or more of the sparse matches must agree with the disparities. On facades, a
 quarter of the sparse matches end at the next window on the epipolar line."""
+
+
+FINER, MIN_NEAR = 2.0, 8
+"""If a wide range of disparities has made the images smaller than 1 / FINER of their size, what
+lies near the plane is matched again in images this many times as large: an eighth of the range is
+searched, so it takes as long. At least MIN_NEAR sparse matches must lie there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +152,8 @@ def match_by_rectification(
     sizes = (grays[0].shape[::-1], grays[1].shape[::-1])
     view = rectified_view(grays, sparse, fundamental, plane)
     tracks = None if view is None else _track(view)
-    if tracks is None and plane is not None:
-        errors = transfer_errors(*sparse, plane)
-        near = errors <= np.quantile(errors, NEAR_PLANE_FRACTION)
-        view = rectified_view(grays, (sparse[0][near], sparse[1][near]), fundamental, plane)
+    if view is not None and tracks is None:
+        view = _finer_view(grays, sparse, fundamental, plane, view)
         tracks = None if view is None else _track(view)
     if view is None or tracks is None:
         return None
@@ -171,13 +170,35 @@ def match_by_rectification(
                 fundamental = _refine(fundamental, sparse, tracks[0], sizes)
     if _agreement(view, sparse) < MIN_AGREEMENT:
         return None
-    # If the rows still do not fit the matrix, only matches that geometry relies on are kept.
     near = row_error * view.scale < MAX_ROW_ERROR_PX
-    disparity = view.disparity if near else np.where(view.relied, view.disparity, np.nan)
-    rows, ends, scores = _sample(view, disparity, xy0)
+    samples = [_sample(view, xy0, relied_only=not near)]
+    fine = _finer_view(grays, sparse, fundamental, plane, view)
+    tracks = None if fine is None else _track(fine)
+    if fine is not None and tracks is not None:
+        fundamental = _refine(fundamental, sparse, tracks[0], sizes)
+        samples.insert(0, _sample(fine, xy0))
+    rows, ends, scores = _first_of(samples)
     ends = _moved_to_lines(xy0[rows], ends, fundamental)
     inside = ((ends > -0.5) & (ends < np.array(sizes[1]) - 0.5)).all(axis=1)
     return fundamental, GuidedMatches(rows[inside], ends[inside], scores[inside], subpixel=True)
+
+
+def _finer_view(
+    grays: Pair,
+    sparse: Pair,
+    fundamental: np.ndarray,
+    plane: np.ndarray | None,
+    coarse: RectifiedView,
+) -> RectifiedView | None:
+    """Rectify larger images for what lies near a plane, if a wide range has made them small."""
+    if plane is None or coarse.scale > 1 / FINER:
+        return None
+    first, second = (coarse.to_frame(points, side) for side, points in enumerate(sparse))
+    limit = (coarse.searched[1] - coarse.searched[0]) / FINER**3 / 2
+    near = np.abs(first[:, 0] - second[:, 0]) < limit
+    if np.count_nonzero(near) < MIN_NEAR:
+        return None
+    return rectified_view(grays, (sparse[0][near], sparse[1][near]), fundamental, plane)
 
 
 def rectified_view(
@@ -323,10 +344,23 @@ def _moved_to_lines(
     return np.asarray(points1 - normal * (distance / squared)[:, None])
 
 
-def _sample(
-    view: RectifiedView, disparity: np.ndarray, xy0: np.ndarray
+def _first_of(
+    samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices of keypoints that have a disparity, their partners and their scores."""
+    """Join samples of several views; of a keypoint in several, the first counts."""
+    rows, ends, scores = map(np.concatenate, zip(*samples, strict=True))
+    rows, one = np.unique(rows, return_index=True)
+    return rows, ends[one], scores[one]
+
+
+def _sample(
+    view: RectifiedView, xy0: np.ndarray, *, relied_only: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the indices of keypoints that have a disparity, their partners and their scores.
+
+    With `relied_only`, only those that geometry relies on.
+    """
+    disparity = np.where(view.relied, view.disparity, np.nan) if relied_only else view.disparity
     height, width = disparity.shape
     positions = view.to_frame(xy0, 0)
     rows, column, row = view.pixels_of(positions)

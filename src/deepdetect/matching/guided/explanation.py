@@ -199,7 +199,7 @@ class Explanation:
         if epipolar is not None:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
             deep = flat is None or _is_deep(*flat, self._seed)
-            ways = (None, part) if flat is None else (flat[0].hypothesis,)
+            ways = (part, None) if flat is None else (flat[0].hypothesis,)
             layer = self._along_rows(pair, judge, epipolar, ways, free) if deep else None
             if layer is not None:
                 yield layer
