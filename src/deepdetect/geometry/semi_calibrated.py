@@ -9,6 +9,7 @@ of the focal length with the best evidence.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -17,6 +18,7 @@ import numpy as np
 from .camera import Calibration, Camera, Size, cross_matrix
 from .estimation import TwoViewModel, fit_essential, fit_shuffled, log10_nfa
 from .relative_pose import Pose, best_of_four, moved_pose
+from .similarity import MAD_STD
 from .transforms import epipolar_errors, signed_epipolar_errors
 
 MIN_MATCHES, MODELS_PER_SAMPLE = 6, 10
@@ -37,6 +39,9 @@ focal lengths from 0, of their difference, and of cx and cy from the middle. Cho
 
 MATCH_SIGMA_PX = 0.5
 """Standard deviation of correct matches from their epipolar lines. Chosen by hand."""
+
+MIN_SIGMA_PX = 0.1
+"""Minimum assumed standard deviation of the errors of matches of one source. Chosen by hand."""
 
 MAX_FITS, MAX_ITERATIONS = 4, 20
 """Pose and cameras are fitted to the inliers at most so often, each time with at most so many steps
@@ -93,6 +98,23 @@ def estimate_semi_calibrated(
         if hopeless:  # chance explains the inliers, and their number does not grow
             break
     return best
+
+
+def refined_by(
+    sources: Sequence[tuple[np.ndarray, np.ndarray]],
+    fundamental: np.ndarray,
+    sizes: tuple[Size, Size],
+) -> np.ndarray:
+    """Refine a fundamental matrix by matches of several sources, weighted by their median errors.
+
+    Each source has (M, 2) positions in both images.
+    """
+    sigmas = []
+    for points0, points1 in sources:
+        median = float(np.median(epipolar_errors(points0, points1, fundamental)))
+        sigmas.append(np.full(len(points0), max(MAD_STD * median, MIN_SIGMA_PX)))
+    points0, points1 = (np.concatenate([each[side] for each in sources]) for side in (0, 1))
+    return refine_fundamental(points0, points1, fundamental, sizes, np.concatenate(sigmas))
 
 
 def refine_fundamental(

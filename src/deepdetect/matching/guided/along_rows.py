@@ -19,7 +19,6 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
-from ...geometry.camera import Size
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
 from ...geometry.images import (
     MAX_ROUND_TRIP_PX,
@@ -29,8 +28,7 @@ from ...geometry.images import (
     local_zncc,
     track_round_trip,
 )
-from ...geometry.semi_calibrated import refine_fundamental
-from ...geometry.similarity import MAD_STD
+from ...geometry.semi_calibrated import refined_by
 from ...geometry.transforms import (
     epipolar_errors,
     scaled_fundamental,
@@ -73,9 +71,6 @@ their rows within the first distance of the refined epipolar lines. Chosen on Ox
 MAX_RANGE_EXCESS = 1.25
 """Scaled-down images are also rectified again if the searched range was more than this many times
 the range of the disparities found. Chosen on Oxford and others."""
-
-MIN_SIGMA_PX = 0.1
-"""Minimum assumed sigma of the errors of tracks and sparse matches. Chosen on Oxford and others."""
 
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 """Maximum number of tracked corners, and side of their windows. Chosen on Oxford and others."""
@@ -158,7 +153,7 @@ def match_by_rectification(
     if view is None or tracks is None:
         return None
     tracked, on_rows = tracks
-    fundamental = _refine(fundamental, sparse, tracked, sizes)
+    fundamental = refined_by((sparse, tracked), fundamental, sizes)
     row_error = np.quantile(epipolar_errors(tracked[0], on_rows, fundamental), ROW_QUANTILE)
     if row_error > MAX_ROW_ERROR_PX or _is_range_too_wide(view):
         again = rectified_view(grays, tracked, fundamental, plane)
@@ -167,7 +162,7 @@ def match_by_rectification(
             counts = [np.count_nonzero(each.relied) for each in (view, again)]
             if counts[1] >= counts[0]:
                 view, row_error = again, 0.0
-                fundamental = _refine(fundamental, sparse, tracks[0], sizes)
+                fundamental = refined_by((sparse, tracks[0]), fundamental, sizes)
     if _agreement(view, sparse) < MIN_AGREEMENT:
         return None
     near = row_error * view.scale < MAX_ROW_ERROR_PX
@@ -175,7 +170,7 @@ def match_by_rectification(
     fine = _finer_view(grays, sparse, fundamental, plane, view)
     tracks = None if fine is None else _track(fine)
     if fine is not None and tracks is not None:
-        fundamental = _refine(fundamental, sparse, tracks[0], sizes)
+        fundamental = refined_by((sparse, tracks[0]), fundamental, sizes)
         samples.insert(0, _sample(fine, xy0))
     rows, ends, scores = _first_of(samples)
     ends = _moved_to_lines(xy0[rows], ends, fundamental)
@@ -305,19 +300,6 @@ def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
     start, ends = start[good], ends[good]
     on_rows = np.column_stack([ends[:, 0], start[:, 1]])
     return (view.from_frame(start, 0), view.from_frame(ends, 1)), view.from_frame(on_rows, 1)
-
-
-def _refine(
-    fundamental: np.ndarray, sparse: Pair, tracked: Pair, sizes: tuple[Size, Size]
-) -> np.ndarray:
-    """Fit the fundamental matrix to sparse matches and tracks, weighted by their median errors."""
-    sigmas = []
-    for points0, points1 in (sparse, tracked):
-        errors = epipolar_errors(points0, points1, fundamental)
-        sigma = max(MAD_STD * float(np.median(errors)), MIN_SIGMA_PX)
-        sigmas.append(np.full(len(points0), sigma))
-    points0, points1 = (np.concatenate([sparse[side], tracked[side]]) for side in (0, 1))
-    return refine_fundamental(points0, points1, fundamental, sizes, np.concatenate(sigmas))
 
 
 def _agreement(view: RectifiedView, sparse: Pair) -> float:

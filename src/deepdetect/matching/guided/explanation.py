@@ -166,6 +166,7 @@ class Explanation:
             epipolar = propose_scene(pair, tentative, self._seed)
         flat: tuple[Layer, PlaneTracks] | None = None
         part: Hypothesis | None = None
+        tracks: PlaneTracks | None = None
         sparse: list[Hypothesis] = []
         flats: list[Hypothesis] = []
         if self._asked != "fundamental":
@@ -198,10 +199,13 @@ class Explanation:
             epipolar = self._apart(pair, flats, epipolar)
         if epipolar is not None:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
-            deep = flat is None or _is_deep(*flat, self._seed)
+            if tracks is not None:
+                epipolar = epipolar.refitted(pair, tracks.points)
             ways = (part, None) if flat is None else (flat[0].hypothesis,)
-            layer = self._along_rows(pair, judge, epipolar, ways, free) if deep else None
-            if layer is not None:
+            layer = None
+            if flat is None or _is_deep(*flat, self._seed) or _is_doubtful(flat[0], epipolar):
+                layer = self._along_rows(pair, judge, epipolar, ways, free)
+            if layer is not None and (flat is None or _wins(layer, *flat, self._seed)):
                 yield layer
             else:
                 sparse.append(epipolar)
@@ -376,6 +380,18 @@ def _is_deep(flat: Layer, tracks: PlaneTracks, seed: int) -> bool:
     parallax = tracks.parallax(seed)
     left = flat.evidence.share < NEARLY_ALL
     return parallax.shows_depth or (left and parallax.shows_foreground)
+
+
+def _is_doubtful(flat: Layer, epipolar: Hypothesis) -> bool:
+    """Return whether a plane leaves so much unexplained that depth may explain more."""
+    few = not _mostly(flat.hypothesis.inliers, epipolar.inliers, NEARLY_ALL)
+    return few and flat.evidence.share < MOST
+
+
+def _wins(deep: Layer, flat: Layer, tracks: PlaneTracks, seed: int) -> bool:
+    """Return whether a scene has depth: by parallax, or because the plane explains less of it."""
+    more = deep.evidence.windows >= MOST * flat.evidence.windows
+    return _is_deep(flat, tracks, seed) or (more and deep.evidence.share > flat.evidence.share)
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:

@@ -89,6 +89,7 @@ class PlaneTracks:
 
     Attributes:
         homography: (3, 3), fitted to the tracks if that makes it more exact.
+        points: (N, 2) in each image, where the tracks start and end.
     """
 
     def __init__(self, pair: ImagePair, homography: np.ndarray, matches: Pair = NOTHING) -> None:
@@ -101,6 +102,8 @@ class PlaneTracks:
         matrix = scaled_homography(homography, scale0, scale1)
         ends = scaled_points(matches[0], scale0), scaled_points(matches[1], scale1)
         self._starts, self._ends = _tracked(first, second, matrix, ends)
+        moved = transform_points(self._ends, matrix)
+        self.points = scaled_points(self._starts, 1 / scale0), scaled_points(moved, 1 / scale1)
         self.homography = homography
         correction = _fitted(self._starts, self._ends)
         if correction is not None:

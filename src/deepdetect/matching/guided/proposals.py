@@ -19,7 +19,7 @@ from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
 from ...features.learned import CROSS_MODAL, LEARNED, LEARNED_RATIO, is_learned, match_learned
 from ...features.matchers import exact_neighbours, match_descriptors
-from ...geometry.semi_calibrated import estimate_semi_calibrated
+from ...geometry.semi_calibrated import estimate_semi_calibrated, refined_by
 from ...geometry.transforms import epipolar_errors, scaled_points, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model
 from ...io.image import MINIMUM_SIDE
@@ -108,6 +108,14 @@ class Hypothesis:
     def threshold_px(self) -> float:
         """Largest error of a match that agrees."""
         return GUIDING_THRESHOLDS_PX[self.model] * self.tentative.pixel
+
+    def refitted(self, pair: ImagePair, tracks: Pair) -> Hypothesis:
+        """Return the fundamental matrix fitted also to tracks that agree with it."""
+        near = self.errors(*tracks) < self.threshold_px
+        if np.count_nonzero(near) < MIN_MATCHES:
+            return self
+        sources = self.points, (tracks[0][near], tracks[1][near])
+        return replace(self, matrix=refined_by(sources, self.matrix, pair.sizes))
 
     def errors(self, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
         """Return the (N,) errors of matches, in pixels."""
@@ -294,7 +302,7 @@ def planes(pair: ImagePair, tentative: Tentative, seed: int) -> Iterator[Hypothe
 
 
 def propose_scene(pair: ImagePair, tentative: Tentative, seed: int) -> Hypothesis | None:
-    """Estimate the fundamental matrix of a scene, also by ordinary cameras if it has few matches."""
+    """Estimate the fundamental matrix of a scene, by ordinary cameras if it has few matches."""
     found = propose(pair, tentative, "fundamental", seed)
     few = found is None or np.count_nonzero(found.inliers) < SEMI_CALIBRATED_MATCHES
     if not few or tentative.views or len(tentative.points0) < MIN_MATCHES:

@@ -193,12 +193,9 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
                 least = min(least, sums[d])
             # A match inside is preferred to one outside with the same cost.
             seen = low < high and inside == least
-            at = 0
-            if seen:
-                at = np.int64(first_inside & np.uint32(0xFFFF))
-            else:
-                while sums[at] != least:
-                    at += 1
+            at = np.int64(first_inside & np.uint32(0xFFFF)) if seen else np.int64(0)
+            while sums[at] != least:
+                at += 1
             best[x] = at
             consistent[y, x] = seen
             uniqueness_ratio[y, x] = np.float32(1)
