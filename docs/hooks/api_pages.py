@@ -66,6 +66,7 @@ _PAGES = (
             "match_features",
             "Matches",
             "features.TwoViewGeometry",
+            "features.Layer",
             "features.Evidence",
             "estimate_geometry",
             "geometry.Geometry",

@@ -30,6 +30,7 @@ def test_writes_matches_and_a_picture(run, photos: Path) -> None:
         np.testing.assert_array_equal(file["inliers"], expected.inliers)
         np.testing.assert_allclose(file["matrix"], expected.geometry.matrix)
         assert str(file["model"]) == expected.geometry.model
+        np.testing.assert_array_equal(file["layer"], expected.layer)
     assert np.asarray(Image.open("out/left_right_matches.jpg")).shape[1] == 400
     assert f"{len(expected):,}" in result.stdout
 
@@ -60,6 +61,7 @@ def test_options_reach_the_matcher(
     assert report["matches"] == len(expected)
     np.testing.assert_array_equal(report["geometry"].pop("matrix"), geometry.matrix)
     assert report["geometry"].pop("evidence") == vars(geometry.evidence)
+    assert report["geometry"].pop("layers") == []  # unguided matching finds none
     told = {name: getattr(geometry, name) for name in ("model", "scene", "confidence")}
     assert report["geometry"] == told
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from deepdetect import DeepDetectError, Keypoints, Matches
-from deepdetect.features.matches import Evidence, TwoViewGeometry
+from deepdetect.features.matches import Evidence, Layer, TwoViewGeometry
 from deepdetect.io import tables
 from deepdetect.io.tables import load_keypoints, load_matches, save_keypoints, save_matches
 
@@ -59,7 +59,9 @@ GEOMETRIES = {
     "no geometry yet": None,
     "none": TwoViewGeometry("none", evidence=Evidence(7, simulated_views=60)),
     "homography": TwoViewGeometry("homography", MATRIX, "planar", "high", EVIDENCE),
-    "fundamental": TwoViewGeometry("fundamental", MATRIX, "depth", "fair", EVIDENCE),
+    "fundamental": TwoViewGeometry(
+        "fundamental", MATRIX, "depth", "fair", EVIDENCE, (Layer("fundamental", MATRIX, 0.6),)
+    ),
 }
 
 
@@ -68,7 +70,7 @@ def test_matches_survive_the_round_trip(tmp_path: Path, kind: str) -> None:
     saved = replace(matches_of(GEOMETRIES[kind]), subpixel=kind == "fundamental")
     save_matches(saved, tmp_path / "m.npz")
     loaded = load_matches(tmp_path / "m.npz")
-    for name in ("points0", "points1", "scores", "inliers"):
+    for name in ("points0", "points1", "scores", "inliers", "layer"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name), err_msg=name)
     assert loaded.subpixel is saved.subpixel
     for one, other in (
@@ -85,6 +87,10 @@ def test_matches_survive_the_round_trip(tmp_path: Path, kind: str) -> None:
     found, given = vars(loaded.geometry), vars(saved.geometry)
     np.testing.assert_array_equal(found.pop("matrix"), given["matrix"])
     assert vars(found.pop("evidence")) == vars(given["evidence"])
+    layers = found.pop("layers"), given["layers"]
+    for one, other in zip(*layers, strict=True):
+        assert (one.model, one.share) == (other.model, other.share)
+        np.testing.assert_array_equal(one.matrix, other.matrix)
     assert found == {name: given[name] for name in ("model", "scene", "confidence")}
 
 

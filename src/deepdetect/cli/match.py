@@ -20,7 +20,7 @@ from ..batch.pair_list import list_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.matchers import MATCHERS_OF_NUMBERS
-from ..features.matches import Matches, TwoViewGeometry
+from ..features.matches import Matches
 from ..features.pictures import draw_all_matches
 from ..features.selection import SelectionOptions
 from ..geometry import GeometryOptions, estimate_geometry
@@ -258,20 +258,29 @@ def _numbers(
         "inliers": int(matches.inliers.sum()),
         "one_to_one": len(matches.unique()),
         "success": matches.success,
-        "geometry": _geometry_values(matches.geometry),
+        "geometry": _geometry_values(matches),
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
         "file": files["file"],
         "picture": files.get("picture"),
     }
 
 
-def _geometry_values(geometry: TwoViewGeometry | None) -> dict[str, Any] | None:
-    if geometry is None:
+def _geometry_values(matches: Matches) -> dict[str, Any] | None:
+    if (geometry := matches.geometry) is None:
         return None
     nfa = geometry.evidence.log10_nfa  # JSON has no infinity
     evidence = vars(geometry.evidence) | {"log10_nfa": nfa if math.isfinite(nfa) else None}
     matrix = None if geometry.matrix is None else geometry.matrix.tolist()
-    return vars(geometry) | {"matrix": matrix, "evidence": evidence}
+    layers = [
+        {
+            "model": each.model,
+            "matrix": each.matrix.tolist(),
+            "share": round(each.share, 4),
+            "matches": int(np.count_nonzero(matches.layer == number)),
+        }
+        for number, each in enumerate(geometry.layers)
+    ]
+    return vars(geometry) | {"matrix": matrix, "evidence": evidence, "layers": layers}
 
 
 @cli.command(REGISTRATION, SELECTION, POINTS, NETWORK, cli.READING)

@@ -1,6 +1,7 @@
 from .keypoints import Keypoints as Keypoints
 from .matches import (
     Evidence as Evidence,
+    Layer as Layer,
     Matches as Matches,
     TwoViewGeometry as TwoViewGeometry,
 )

@@ -62,6 +62,27 @@ class Evidence:
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
+class Layer:
+    """One of the geometries of a pair: of the scene, or of something that moves on its own.
+
+    Attributes:
+        model: "homography" or "fundamental".
+        matrix: (3, 3) float64, as of `TwoViewGeometry`.
+        share: fraction of what both images show in common that this geometry explains; 0 if it is
+            known from sparse matches only.
+    """
+
+    model: str
+    matrix: np.ndarray
+    share: float
+
+    def swapped(self) -> Layer:
+        """Return the geometry from the second image to the first."""
+        return replace(self, matrix=_swapped(self.model, self.matrix))
+
+
+@suggest_keywords
+@dataclass(frozen=True, eq=False)
 class TwoViewGeometry:
     """The geometry between two images.
 
@@ -77,6 +98,8 @@ class TwoViewGeometry:
         confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" if the model
             is "none".
         evidence: the measurements on which the decision rests.
+        layers: what guided matching found, the geometry that explains most first. The others
+            explain what moves on its own. `Matches.layer` tells which of them a match follows.
     """
 
     model: str
@@ -84,13 +107,20 @@ class TwoViewGeometry:
     scene: str = "none"
     confidence: str = "none"
     evidence: Evidence = field(default_factory=Evidence)
+    layers: tuple[Layer, ...] = ()
 
     def swapped(self) -> TwoViewGeometry:
         """Return the geometry from the second image to the first."""
-        if self.matrix is None or self.model != "homography":
-            return replace(self, matrix=None if self.matrix is None else self.matrix.T)
-        inverse = np.linalg.inv(self.matrix)
-        return replace(self, matrix=inverse / inverse[2, 2])
+        matrix = None if self.matrix is None else _swapped(self.model, self.matrix)
+        layers = tuple(layer.swapped() for layer in self.layers)
+        return replace(self, matrix=matrix, layers=layers)
+
+
+def _swapped(model: str, matrix: np.ndarray) -> np.ndarray:
+    if model != "homography":
+        return matrix.T
+    inverse = np.linalg.inv(matrix)
+    return np.asarray(inverse / inverse[2, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +138,7 @@ class GuidedMatches:
         alike: (M,) bool, False if the images contradict a match. Surrounding matches predict where
             the second image shows the window around a match in the first image; in contradicted
             matches, the window is no more similar to that place than to unrelated windows.
+        layer: (M,) int8 number of the geometry that a match follows.
     """
 
     indices0: np.ndarray
@@ -117,6 +148,7 @@ class GuidedMatches:
     indices1: np.ndarray | None = None
     points0: np.ndarray | None = None
     alike: np.ndarray | None = None
+    layer: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.indices0)
@@ -169,6 +201,8 @@ class Matches:
             whose pixel a match starts, and `indices1` the keypoint nearest to its end, up to a
             pixel away, or -1 (`m[m.indices1 >= 0]` drops matches without a keypoint); with
             `mutual`, these roles may be swapped. None: the nearest keypoints are looked up.
+        layer: (M,) int8, which of `geometry.layers` a match follows, or -1 without layers, for
+            which None stands: `m[m.layer == 0]` has the matches of the scene.
 
     With the same options, an index means the same keypoint in all pairs with this image, because
     keypoints do not depend on the other image. So matches of several pairs can be joined to tracks.
@@ -199,6 +233,7 @@ class Matches:
     subpixel: bool = False
     indices0: np.ndarray = None  # type: ignore[assignment]  # never None after construction
     indices1: np.ndarray = None  # type: ignore[assignment]
+    layer: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         for name, dtype in _COLUMNS.items():
@@ -235,6 +270,10 @@ class Matches:
                     f"[{indices.min()}, {indices.max()}]"
                 )
             object.__setattr__(self, name, indices.astype(np.int32))
+        layer = np.full(len(self), -1) if self.layer is None else np.asarray(self.layer)
+        if layer.shape != (len(self),):
+            raise OptionError(f"matches need one number per match in layer, not {layer.shape}")
+        object.__setattr__(self, "layer", layer.astype(np.int8))
 
     def __getstate__(self) -> dict[str, Any]:
         # The state that is pickled holds the keypoints, not functions that find them.
@@ -371,7 +410,7 @@ class Matches:
 
     def __getitem__(self, index: slice | np.ndarray | Sequence[int] | int) -> Matches:
         rows = [int(index)] if isinstance(index, (int, np.integer)) else index
-        names = (*_COLUMNS, "indices0", "indices1")
+        names = (*_COLUMNS, "indices0", "indices1", "layer")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def _repr_html_(self) -> str:

@@ -15,12 +15,14 @@ from .._shared.errors import ImageError, InvalidFileError, MissingFileError, Opt
 from .._shared.options import suggest_keywords
 from .._shared.records import save_arrays
 from ..features.keypoints import Keypoints
-from ..features.matches import Evidence, Matches, TwoViewGeometry
+from ..features.matches import Evidence, Layer, Matches, TwoViewGeometry
 
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
 """These attributes of keypoints may be None. An npz file contains those that are not."""
 
-MATCH_VALUES = ("points0", "points1", "scores", "inliers", "subpixel", "indices0", "indices1")
+MATCH_VALUES = (
+    *("points0", "points1", "scores", "inliers", "subpixel", "indices0", "indices1", "layer"),
+)
 """An npz file contains these attributes of `Matches`, in addition to keypoints and geometry."""
 
 CSV_ROWS = 100_000
@@ -82,12 +84,14 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         matches: the matches.
         path: ending in .npz or .csv. An npz file has the attributes of `Matches`: `points0` and
             `points1` (M, 2) float32, `indices0` and `indices1` (M,) int32 (the rows of the matched
-            keypoints in `keypoints0` and `keypoints1`), `scores` (M,) float32, `inliers` (M,) bool
-            and `subpixel` bool. The keypoints of the first image are `keypoints0` (N, 2) float32,
-            `keypoint_scores0` (N,) float32 and `image_size0` (width, height); the names for the
-            second image end in 1. If there is a geometry, the file has the strings `model`, `scene`
-            and `confidence`, the (3, 3) `matrix` (if unknown, an empty (0, 0) array), and the
-            numbers of `Evidence`. A CSV file has the columns x0, y0, x1, y1, score, inlier.
+            keypoints in `keypoints0` and `keypoints1`), `scores` (M,) float32, `inliers` (M,) bool,
+            `layer` (M,) int8 and `subpixel` bool. The keypoints of the first image are `keypoints0`
+            (N, 2) float32, `keypoint_scores0` (N,) float32 and `image_size0` (width, height); the
+            names for the second image end in 1. If there is a geometry, the file has the strings
+            `model`, `scene` and `confidence`, the (3, 3) `matrix` (if unknown, an empty (0, 0)
+            array), the numbers of `Evidence`, and its L layers as `layer_model` (L,),
+            `layer_matrix` (L, 3, 3) and `layer_share` (L,). A CSV file has the columns x0, y0, x1,
+            y1, score, inlier.
 
     Raises:
         OptionError: the path has another ending.
@@ -105,6 +109,10 @@ def save_matches(matches: Matches, path: str | Path) -> None:
     if matches.geometry is not None:
         values |= vars(matches.geometry) | vars(matches.geometry.evidence)
         del values["evidence"]
+        layers = values.pop("layers")
+        values["layer_model"] = np.array([each.model for each in layers], np.str_)
+        values["layer_matrix"] = np.array([each.matrix for each in layers]).reshape(-1, 3, 3)
+        values["layer_share"] = np.array([each.share for each in layers])
     none = np.empty((0, 0))
     save_arrays(path, {name: none if value is None else value for name, value in values.items()})
 
@@ -126,7 +134,12 @@ def load_matches(path: str | Path) -> Matches:
         if "model" in arrays:
             evidence = Evidence(**{each.name: arrays[each.name] for each in fields(Evidence)})
             values = {name: arrays[name] for name in ("model", "matrix", "scene", "confidence")}
-            geometry = TwoViewGeometry(**values, evidence=evidence)
+            columns = (arrays[f"layer_{name}"] for name in ("model", "matrix", "share"))
+            layers = [
+                Layer(str(model), matrix, float(share))
+                for model, matrix, share in zip(*columns, strict=True)
+            ]
+            geometry = TwoViewGeometry(**values, evidence=evidence, layers=tuple(layers))
         values = {name: arrays[name] for name in MATCH_VALUES}
         return Matches(
             **values, keypoints0=keypoints[0], keypoints1=keypoints[1], geometry=geometry

@@ -265,6 +265,7 @@ def _match_guided(
         matched.subpixel,
         matched.indices0,
         matched.indices1,  # type: ignore[arg-type]  # None: looked up later
+        matched.layer,  # type: ignore[arg-type]
     )
 
 

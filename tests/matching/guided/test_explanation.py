@@ -151,10 +151,14 @@ def test_a_plane_that_moves_otherwise_keeps_its_matches_and_spoils_no_others(
     every = np.stack(np.meshgrid(np.arange(0, 450, 2), np.arange(0, 375, 2)), -1).reshape(-1, 2)
     guide, found = explained(grays, every)
     assert guide.scene.startswith("depth") or side > 200  # the larger poster explains most
+    assert len(guide.layers) >= 2
     starts = every[found.indices0]
     moved = found.points1 - starts
     of_poster = (np.abs(moved - (210, 110)) < 1).all(axis=1)
     assert np.count_nonzero(of_poster) > 0.7 * (side / 2) ** 2
+    own = np.bincount(found.layer[of_poster]).argmax()
+    assert (found.layer == own)[of_poster].mean() > 0.97
+    assert of_poster[found.layer == own].mean() > 0.97
     beside = (starts > 20 + side).any(axis=1)
     assert np.count_nonzero(beside) > 0.2 * len(every)
     # Close around the larger poster, which explains most, some keypoints count as part of it.

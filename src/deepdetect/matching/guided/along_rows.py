@@ -46,7 +46,7 @@ from .image_pair import Pair
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """Options for matching rows. The range of disparities is set for each pair."""
 
-MAX_VOLUME = 5e7
+MAX_VOLUME = 2.5e7
 """Images are scaled down if pixels times disparities exceed this, to bound time and memory."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25

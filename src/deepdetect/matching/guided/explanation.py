@@ -12,6 +12,7 @@ from ..._shared.errors import ImageError
 from ...features.keypoints import Keypoints, nearest_keypoints
 from ...features.matches import MAX_KEYPOINT_DISTANCE_PX, GuidedMatches, TwoViewGeometry
 from ...features.matches import Evidence as PublicEvidence
+from ...features.matches import Layer as PublicLayer
 from ...geometry.camera import Size
 from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
@@ -304,6 +305,9 @@ class Explanation:
         for layer in self.layers[1:]:
             new = ~np.isin(layer.matches.indices0, matches.indices0)
             matches = matches.joined(layer.matches, new)
+        number = np.zeros(len(matches), np.int8)
+        for k, layer in reversed([*enumerate(self.layers)]):
+            number[np.isin(matches.indices0, layer.matches.indices0)] = k
         starts = matches.starts(self.pixels[0])
         alike = np.ones(len(matches), bool)
         if first.dense and own.model == "fundamental":
@@ -325,11 +329,16 @@ class Explanation:
             correlation=first.evidence.correlation,
             left_out=self.left_out,
         )
+        layers = (
+            PublicLayer(own.model, own.matrix, float(layer.evidence.share))
+            for layer in self.layers
+            for own in (layer.hypothesis,)
+        )
         geometry = TwoViewGeometry(
-            own.model, own.matrix, "none", "high" if high else "fair", evidence
+            own.model, own.matrix, "none", "high" if high else "fair", evidence, tuple(layers)
         )
         geometry = self._with_scene(geometry, starts, matches.points1)
-        return geometry, replace(matches, alike=alike)
+        return geometry, replace(matches, alike=alike, layer=number)
 
     def _with_scene(
         self, geometry: TwoViewGeometry, points0: np.ndarray, points1: np.ndarray
