@@ -4,7 +4,7 @@
 
 Writes OUTPUT/SCENE/H1toKp.refined for homographies that are clearly better than the published ones,
 which are off by up to 26 px, and prints a table. OUTPUT may be OXFORD itself. Lucas-Kanade on the
-warped images (`datasets.homography_refinement`) starts from the published homography and from one
+warped images (`homography_refinement`) starts from the published homography and from one
 by SIFT and MAGSAC, and the result with the highest correlation is taken. So no detector that the
 benchmark evaluates determines the result.
 """
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from homography_refinement import refine_homography
 
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.progress import progress
@@ -27,7 +28,6 @@ from deepdetect.geometry.images import (
     warped_zncc,
 )
 from deepdetect.io.image import load_image, luma
-from deepdetect_lab.datasets.homography_refinement import refine_homography
 from deepdetect_lab.datasets.planar import PlanarPair, load_oxford
 from deepdetect_lab.evaluation.metrics.homography import project_visible
 from deepdetect_lab.evaluation.report import Row, Table

@@ -74,7 +74,7 @@ def _convex_hull(region: np.ndarray) -> tuple[np.ndarray, bool]:
         return hull > 0, False
     first = region[rows].argmax(axis=1)
     last = region.shape[1] - 1 - region[rows, ::-1].argmax(axis=1)
-    ends = np.concatenate([np.column_stack([first, rows]), np.column_stack([last, rows])])
+    ends = np.column_stack([np.append(first, last), np.append(rows, rows)])
     corners = cv2.convexHull(ends.astype(np.int32))
     cv2.fillConvexPoly(hull, corners, 1)
     cv2.polylines(outline, [corners], True, 1)

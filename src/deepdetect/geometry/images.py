@@ -18,10 +18,6 @@ WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25
 """Images are blurred by this sigma against noise before they are compared. Chosen by hand."""
 
-NOISE_STD = 2.0
-"""`normalise_local_contrast` adds the square of this number of grey levels to the variance of each
-window, so that noise is not amplified in flat windows. Chosen by hand."""
-
 MAX_UNKNOWN_WEIGHT = 1e-3
 """Maximum total weight of pixels without data in an interpolated pixel. Chosen by hand."""
 
@@ -177,15 +173,6 @@ def gaussian_blur(gray: np.ndarray, sigma_px: float) -> np.ndarray:
 def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
     """Shrink an (H, W) bool mask by the pixels that a blur mixes with pixels outside the mask."""
     return _erode(mask, 2 * int(np.ceil(3 * blur_sigma_px)) + 1)
-
-
-def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
-    """Subtract each window's mean and divide by its standard deviation; return (H, W) float32."""
-    window = (WINDOW_PX, WINDOW_PX)
-    values = gray.astype(np.float32)
-    mean = cv2.boxFilter(values, cv2.CV_32F, window)
-    variance = cv2.boxFilter(values * values, cv2.CV_32F, window) - mean * mean
-    return (values - mean) / np.sqrt(np.maximum(variance, 0) + NOISE_STD**2)
 
 
 def _erode(mask: np.ndarray, side: int) -> np.ndarray:

@@ -100,41 +100,26 @@ def estimate_semi_calibrated(
     return best
 
 
-def refined_by(
+def refine_fundamental(
     sources: Sequence[tuple[np.ndarray, np.ndarray]],
     fundamental: np.ndarray,
     sizes: tuple[Size, Size],
 ) -> np.ndarray:
-    """Refine a fundamental matrix by matches of several sources, weighted by their median errors.
-
-    Each source has (M, 2) positions in both images.
-    """
-    sigmas = []
-    for points0, points1 in sources:
-        median = float(np.median(epipolar_errors(points0, points1, fundamental)))
-        sigmas.append(np.full(len(points0), max(MAD_STD * median, MIN_SIGMA_PX)))
-    points0, points1 = (np.concatenate([each[side] for each in sources]) for side in (0, 1))
-    return refine_fundamental(points0, points1, fundamental, sizes, np.concatenate(sigmas))
-
-
-def refine_fundamental(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    fundamental: np.ndarray,
-    sizes: tuple[Size, Size],
-    match_sigmas_px: np.ndarray,
-) -> np.ndarray:
     """Refine a fundamental matrix by matches, most of them correct, and a prior on the cameras.
 
-    `match_sigmas_px` are the (M,) expected standard deviations of the matches' distances from their
-    epipolar lines. The result has norm 1; fewer than six matches change nothing.
+    Each source has (M, 2) positions in both images, which its median error weights. The result has
+    norm 1; fewer than six matches change nothing.
     """
+    points0, points1 = (np.concatenate([each[side] for each in sources]) for side in (0, 1))
     if len(points0) < MIN_MATCHES:
         return fundamental
+    medians = [np.median(epipolar_errors(*each, fundamental)) for each in sources]
+    sigmas = np.maximum(MAD_STD * np.array(medians), MIN_SIGMA_PX)
     cameras = _nearest_cameras(fundamental, sizes)
     essential = cameras.essential(fundamental)
     views = best_of_four(essential, points0, points1, cameras.calibration), cameras
-    matrix = _fundamental(*_fit(views, points0, points1, match_sigmas_px))
+    of_matches = np.repeat(sigmas, [len(each[0]) for each in sources])
+    matrix = _fundamental(*_fit(views, points0, points1, of_matches))
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 

@@ -1,18 +1,158 @@
-"""Dense matches along a homography: it predicts the partner of every keypoint."""
+"""A plane: tracks make its homography exact and show parallax off it; it predicts dense matches.
+
+The second image is warped by the homography of a plane. Corners and tentative matches are tracked
+to it. The homography of the plane with most tracks is fitted to them. It is cross-validated: the
+image is divided into the black and the white squares of a chessboard, and the fits to either colour
+must agree with no fewer tracks on the other than the homography before.
+
+If the homography does not explain a place of a static scene, the place is displaced along a line
+through the epipole (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant
+plane", 2005). Lens distortion, wind and wrong tracks displace places in any direction.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 
+from ..._shared.opencv import cv2
 from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches
-from ...geometry.transforms import transform_points
+from ...geometry.estimation import GeometryOptions, estimate_geometry
+from ...geometry.images import MAX_ROUND_TRIP_PX, equalise, track_round_trip, warp_to_reference
+from ...geometry.transforms import scaled_homography, scaled_points, transform_points
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
+
+SIDE_PX, MAX_SCALE_RATIO, MIN_SCALE = 1024, 1.5, 1 / 16
+"""Images are reduced to this longer side. If their scales differ by more than the first factor, the
+finer one is reduced further, because corners of different scales lie at different places; at most
+to the second. Lengths below are in pixels of the reduced images."""
+
+CORNERS, WINDOW_PX, CELL_PX = 1500, 21, 16
+"""Maximum number of tracked corners, side of their windows, and of the squares from which one track
+each shows parallax."""
+
+MIN_TRACKS, SQUARES = 15, 8
+"""A homography is fitted to at least this number of tracks. The chessboard has this many squares
+along the longer side."""
+
+MAX_PARALLAX_PX = 60.0
+"""Tentative matches farther from the plane than this are not tracked: the views are too unlike."""
+
+NOISE_PX = 1.0
+"""Tracks that miss the plane by less than this may be inexact. The error of tracks is a third."""
 
 MAX_DISTANCE_PX = 1.0
 """A keypoint of the second image may be a partner if it is nearer than this to the place where the
 homography maps the keypoint of the first image: positions are whole pixels."""
+
+SAMPLES, MAX_ANGLE = 1000, 0.25
+"""Epipoles that are tried, and angle in radians between a displacement and its line that still
+agree: a third of the error of tracks for each pixel."""
+
+MIN_ALIGNED, MIN_SHARE, MIN_FAR_SHARE = 0.8, 0.08, 0.02
+"""A scene has depth if at least the first fraction of the places off the plane agrees with an
+epipole, and the second fraction of all places is off the plane and agrees. Something stands before
+the plane if the first fraction of what is off by more than `FAR` times the noise agrees, and the
+third fraction of all places is so. By chance, 0.16 of the places agree."""
+
+FAR = 3.0
+
+
+NOTHING: Pair = np.empty((0, 2)), np.empty((0, 2))
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """How the places off a plane move.
+
+    Attributes:
+        aligned: fraction of the places off the plane that agree with the best epipole.
+        share: fraction of all places that are off the plane and agree with it.
+        far_aligned, far_share: the same of the places that are clearly off the plane.
+    """
+
+    aligned: float = 0.0
+    share: float = 0.0
+    far_aligned: float = 0.0
+    far_share: float = 0.0
+
+    @property
+    def shows_depth(self) -> bool:
+        """Whether the scene has depth."""
+        return self.aligned >= MIN_ALIGNED and self.share >= MIN_SHARE
+
+    @property
+    def shows_foreground(self) -> bool:
+        """Whether something stands before the plane, or behind it, however small."""
+        return self.far_aligned >= MIN_ALIGNED and self.far_share >= MIN_FAR_SHARE
+
+
+class PlaneTracks:
+    """Corners and matches, (M, 2) in both images, tracked relative to the plane of a homography.
+
+    Attributes:
+        homography: (3, 3), fitted to the tracks if that makes it more exact.
+        points: (N, 2) in each image, where the tracks start and end.
+    """
+
+    def __init__(self, pair: ImagePair, homography: np.ndarray, matches: Pair = NOTHING) -> None:
+        scales = _scales_at_centre(homography, pair.sizes[0])
+        (first, scale0), (second, scale1) = (
+            pair.reduced(side, min(SIDE_PX, round(max(size) * scale)))
+            for side, (size, scale) in enumerate(zip(pair.sizes, scales, strict=True))
+        )
+        self._side = max(first.shape)
+        matrix = scaled_homography(homography, scale0, scale1)
+        ends = scaled_points(matches[0], scale0), scaled_points(matches[1], scale1)
+        self._starts, self._ends = _tracked(first, second, matrix, ends)
+        moved = transform_points(self._ends, matrix)
+        self.points = scaled_points(self._starts, 1 / scale0), scaled_points(moved, 1 / scale1)
+        self.homography = homography
+        correction = _fitted(self._starts, self._ends)
+        if correction is not None:
+            if self._validated():
+                refined = scaled_homography(matrix @ correction, 1 / scale0, 1 / scale1)
+                self.homography = refined / refined[2, 2]
+            self._ends = transform_points(self._ends, np.linalg.inv(correction))
+
+    def _validated(self) -> bool:
+        """Return whether a fit to half of the squares brings no fewer others to the plane."""
+        starts, ends = self._starts, self._ends
+        black = (starts // (self._side / SQUARES)).sum(axis=1) % 2 == 1
+        gain = -np.count_nonzero(_on_plane(starts, ends))
+        for used in (black, ~black):
+            found = _fitted(starts[used], ends[used])
+            if found is None:
+                return False
+            gain += np.count_nonzero(_on_plane(transform_points(starts, found), ends) & ~used)
+        return bool(gain >= 0)
+
+    @cached_property
+    def _moved(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places, one per square, and their displacements from the plane, (N, 2) each."""
+        _, one = np.unique((self._starts // CELL_PX).astype(int), axis=0, return_index=True)
+        return self._starts[one], (self._ends - self._starts)[one]
+
+    def parallax(self, seed: int = 0) -> Parallax:
+        """Return how the places off the plane move."""
+        places, moved = self._moved
+        length = np.linalg.norm(moved, axis=1)
+        off = length > NOISE_PX
+        if np.count_nonzero(off) < 3:
+            return Parallax()
+        agreeing = _agreeing(places[off], moved[off] / length[off, None], self._side, seed)
+        far = length[off] > FAR * NOISE_PX
+        clear, clearly_off = (int(np.count_nonzero(each)) for each in (agreeing & far, far))
+        return Parallax(
+            float(agreeing.mean()),
+            float(agreeing.sum() / len(off)),
+            clear / max(clearly_off, 1),
+            clear / len(off),
+        )
 
 
 def match_along_plane(
@@ -29,3 +169,75 @@ def match_along_plane(
     scores = np.nan_to_num(evidence.similarity[cells][kept], nan=evidence.bound).astype(np.float32)
     ends = pixels[1][indices1].astype(np.float64)
     return GuidedMatches(indices0, ends, scores.clip(0, 1), indices1=indices1)
+
+
+def _on_plane(expected: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(ends - expected, axis=1) < NOISE_PX)
+
+
+def _fitted(starts: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
+    """Return the homography of the plane with most tracks; None if there are too few."""
+    if len(starts) < MIN_TRACKS:
+        return None
+    options = GeometryOptions(inlier_threshold=NOISE_PX)
+    found = estimate_geometry(starts, ends, "homography", options=options).matrix
+    if found is None:
+        return None
+    near = np.linalg.norm(ends - transform_points(starts, found), axis=1) < NOISE_PX / 2
+    if np.count_nonzero(near) < MIN_TRACKS:
+        return None
+    least_squares, _ = cv2.findHomography(starts[near], ends[near])
+    return None if least_squares is None else np.asarray(least_squares)
+
+
+def _tracked(first: np.ndarray, second: np.ndarray, matrix: np.ndarray, matches: Pair) -> Pair:
+    """Return (N, 2) starts of tracks in the first image, and their ends, moved there."""
+    warped, valid = warp_to_reference(second, matrix, first.shape[::-1], exact=True)
+    inside = cv2.erode(valid.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX)), borderValue=0)
+    equalised = equalise(first)
+    corners = cv2.goodFeaturesToTrack(equalised, CORNERS, 0.001, 5, mask=inside)
+    starts = np.empty((0, 2)) if corners is None else corners.reshape(-1, 2)
+    ends = transform_points(matches[1], np.linalg.inv(matrix))
+    near = np.linalg.norm(ends - matches[0], axis=1) < MAX_PARALLAX_PX
+    starts, expected = (
+        np.concatenate(both).astype(np.float32)
+        for both in ((starts, matches[0][near]), (starts, ends[near]))
+    )
+    if not len(starts):
+        return np.empty((0, 2)), np.empty((0, 2))
+    tracked, gaps = track_round_trip(
+        equalised, equalise(warped), starts, WINDOW_PX, levels=1, expected=expected
+    )
+    good = gaps < MAX_ROUND_TRIP_PX
+    return starts[good].astype(np.float64), tracked[good].astype(np.float64)
+
+
+def _scales_at_centre(homography: np.ndarray, size: tuple[int, int]) -> tuple[float, float]:
+    """Return the factors by which to scale the images so that both show equally fine detail."""
+    centre = np.array([size[0] / 2, size[1] / 2])
+    around = transform_points(centre + [[0, 0], [1, 0], [0, 1]], homography)
+    if not np.isfinite(around).all():
+        return 1.0, 1.0
+    largest, smallest = np.linalg.svd(around[1:] - around[0], compute_uv=False)
+    if largest * MAX_SCALE_RATIO < 1:
+        return max(float(largest), MIN_SCALE), 1.0
+    if smallest > MAX_SCALE_RATIO:
+        return 1.0, max(1 / float(smallest), MIN_SCALE)
+    return 1.0, 1.0
+
+
+def _agreeing(places: np.ndarray, directions: np.ndarray, side: int, seed: int) -> np.ndarray:
+    """Return which of (N, 2) directions agree with the epipole with which most agree, (N,) bool."""
+    places = np.column_stack([places / side - 0.5, np.ones(len(places))])
+    lines = np.cross(places, np.column_stack([directions, np.zeros(len(directions))]))
+    chosen = np.random.default_rng(seed).integers(0, len(lines), (SAMPLES, 2))
+    epipoles = np.cross(lines[chosen[:, 0]], lines[chosen[:, 1]])
+    length = np.linalg.norm(epipoles, axis=1)
+    epipoles = epipoles[length > 1e-3] / length[length > 1e-3, None]
+    if not len(epipoles):
+        return np.zeros(len(places), bool)
+    towards = epipoles[:, None, :2] - epipoles[:, None, 2:] * places[None, :, :2]
+    towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)
+    across = np.abs(towards[..., 0] * directions[:, 1] - towards[..., 1] * directions[:, 0])
+    agreeing = across < MAX_ANGLE
+    return np.asarray(agreeing[np.argmax(np.count_nonzero(agreeing, axis=1))])

@@ -28,7 +28,7 @@ from ...geometry.images import (
     local_zncc,
     track_round_trip,
 )
-from ...geometry.semi_calibrated import refined_by
+from ...geometry.semi_calibrated import refine_fundamental
 from ...geometry.transforms import (
     epipolar_errors,
     scaled_fundamental,
@@ -153,7 +153,7 @@ def match_by_rectification(
     if view is None or tracks is None:
         return None
     tracked, on_rows = tracks
-    fundamental = refined_by((sparse, tracked), fundamental, sizes)
+    fundamental = refine_fundamental((sparse, tracked), fundamental, sizes)
     row_error = np.quantile(epipolar_errors(tracked[0], on_rows, fundamental), ROW_QUANTILE)
     if row_error > MAX_ROW_ERROR_PX or _is_range_too_wide(view):
         again = rectified_view(grays, tracked, fundamental, plane)
@@ -162,7 +162,7 @@ def match_by_rectification(
             counts = [np.count_nonzero(each.relied) for each in (view, again)]
             if counts[1] >= counts[0]:
                 view, row_error = again, 0.0
-                fundamental = refined_by((sparse, tracks[0]), fundamental, sizes)
+                fundamental = refine_fundamental((sparse, tracks[0]), fundamental, sizes)
     if _agreement(view, sparse) < MIN_AGREEMENT:
         return None
     near = row_error * view.scale < MAX_ROW_ERROR_PX
@@ -170,7 +170,7 @@ def match_by_rectification(
     fine = _finer_view(grays, sparse, fundamental, plane, view)
     tracks = None if fine is None else _track(fine)
     if fine is not None and tracks is not None:
-        fundamental = refined_by((sparse, tracks[0]), fundamental, sizes)
+        fundamental = refine_fundamental((sparse, tracks[0]), fundamental, sizes)
         samples.insert(0, _sample(fine, xy0))
     rows, ends, scores = _first_of(samples)
     ends = _moved_to_lines(xy0[rows], ends, fundamental)

@@ -18,11 +18,10 @@ from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.transforms import outer_corners, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
-from .along_plane import match_along_plane
+from .along_plane import PlaneTracks, match_along_plane
 from .along_rows import match_by_rectification
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
-from .plane_tracks import PlaneTracks
 from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose, propose_scene
 
 MIN_MATCHED_FRACTION = 0.02
@@ -316,9 +315,8 @@ class Explanation:
             alike = ~first.evidence.contradicted[cells]
             for layer in self.layers[1:]:
                 alike |= layer.evidence.explained[cells]
-        high = first.dense and first.evidence.share >= HIGH_SHARE
-        high = high and own.log10_nfa < HIGH_LOG10_NFA
-        high = high and len(first.matches) >= MOST * len(matches)
+        strong = first.evidence.share >= HIGH_SHARE and own.log10_nfa < HIGH_LOG10_NFA
+        high = first.dense and strong and len(first.matches) >= MOST * len(matches)
         evidence = PublicEvidence(
             len(own.tentative.points0),
             int(np.count_nonzero(own.inliers)),
@@ -329,11 +327,8 @@ class Explanation:
             correlation=first.evidence.correlation,
             left_out=self.left_out,
         )
-        layers = (
-            PublicLayer(own.model, own.matrix, float(layer.evidence.share))
-            for layer in self.layers
-            for own in (layer.hypothesis,)
-        )
+        each = ((layer.hypothesis, layer.evidence.share) for layer in self.layers)
+        layers = (PublicLayer(found.model, found.matrix, share) for found, share in each)
         geometry = TwoViewGeometry(
             own.model, own.matrix, "none", "high" if high else "fair", evidence, tuple(layers)
         )

@@ -21,6 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from ..._shared.opencv import cv2
+from ...geometry.estimation import GeometryOptions, estimate_geometry
 from ...geometry.transforms import (
     scaled_homography,
     scaled_points,
@@ -146,7 +147,7 @@ class Evidence:
     def share(self) -> float:
         """Fraction of the compared cells that are explained."""
         known = np.count_nonzero(np.isfinite(self.similarity))
-        return np.count_nonzero(self.explained) / known if known else 0.0
+        return float(np.count_nonzero(self.explained) / known) if known else 0.0
 
 
 class Judge:
@@ -383,10 +384,8 @@ class View:
                 return result, field
             starts = here[every, every][good]
             ends = starts + field[every, every][good] + np.array(around)[near.argmax(axis=0)[good]]
-            try:
-                matrix, _ = cv2.findHomography(starts, ends, cv2.USAC_MAGSAC, 1.5)
-            except cv2.error:  # for rare orders of the matches
-                return result, field
+            options = GeometryOptions(inlier_threshold=1.5)
+            matrix = estimate_geometry(starts, ends, "homography", options=options).matrix
             if matrix is None:
                 return result, field
             mapped = cv2.perspectiveTransform(here.reshape(1, -1, 2), matrix).reshape(here.shape)

@@ -19,7 +19,7 @@ from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
 from ...features.learned import CROSS_MODAL, LEARNED, LEARNED_RATIO, is_learned, match_learned
 from ...features.matchers import exact_neighbours, match_descriptors
-from ...geometry.semi_calibrated import estimate_semi_calibrated, refined_by
+from ...geometry.semi_calibrated import estimate_semi_calibrated, refine_fundamental
 from ...geometry.transforms import epipolar_errors, scaled_points, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model
 from ...io.image import MINIMUM_SIDE
@@ -115,7 +115,7 @@ class Hypothesis:
         if np.count_nonzero(near) < MIN_MATCHES:
             return self
         sources = self.points, (tracks[0][near], tracks[1][near])
-        return replace(self, matrix=refined_by(sources, self.matrix, pair.sizes))
+        return replace(self, matrix=refine_fundamental(sources, self.matrix, pair.sizes))
 
     def errors(self, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
         """Return the (N,) errors of matches, in pixels."""
@@ -310,9 +310,8 @@ def propose_scene(pair: ImagePair, tentative: Tentative, seed: int) -> Hypothesi
     threshold_px = GUIDING_THRESHOLDS_PX["fundamental"] * tentative.pixel
     ends = tentative.points0, tentative.points1
     known = estimate_semi_calibrated(*ends, pair.sizes, threshold_px, seed)
-    if known is None or known.matrix is None or not known.trusted:
-        return found
-    if found is not None and found.log10_nfa <= known.log10_nfa:
+    least = np.inf if found is None else found.log10_nfa
+    if known is None or known.matrix is None or not known.trusted or known.log10_nfa >= least:
         return found
     return Hypothesis("fundamental", known.matrix, known.inliers, known.log10_nfa, tentative)
 

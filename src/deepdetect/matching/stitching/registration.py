@@ -27,10 +27,9 @@ from ...geometry.transforms import scaled_points, transfer_errors, transform_poi
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 from ...io.image import luma
 from ..guided import ImagePair, Tentative
-from ..guided.along_plane import match_along_plane
+from ..guided.along_plane import PlaneTracks, match_along_plane
 from ..guided.explanation import MIN_MATCHED_FRACTION, stands_still, straight_lines
 from ..guided.judge import Judge
-from ..guided.plane_tracks import PlaneTracks
 from ..guided.proposals import (
     LEARNED_KEYPOINTS,
     LEARNED_SIDE_PX,

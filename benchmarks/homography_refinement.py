@@ -16,7 +16,6 @@ from functools import partial
 import numpy as np
 
 from deepdetect._shared.opencv import cv2
-from deepdetect.geometry.homography_fit import fit_homography_irls
 from deepdetect.geometry.images import (
     BLUR_SIGMA_PX,
     MAX_ROUND_TRIP_PX,
@@ -26,11 +25,10 @@ from deepdetect.geometry.images import (
     erode_mask,
     gaussian_blur,
     local_zncc,
-    normalise_local_contrast,
     track_round_trip,
     warp_to_reference,
 )
-from deepdetect.geometry.transforms import scaled_homography
+from deepdetect.geometry.transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
 """Each round has a side of the tracked windows in pixels, a maximum number of corners, and a number
@@ -46,6 +44,13 @@ the second value. Chosen by hand."""
 ALIGNMENT_SIDE_PX, ALIGNMENT_SIGMA_PX, ALIGNMENT_ITERATIONS = 480, 1.0, 15
 """Images are reduced to this longer side and blurred with this sigma before their pixels are
 aligned. Chosen by hand."""
+
+IRLS_ITERATIONS = 30
+"""Maximum number of steps; a step that changes nothing ends the fit."""
+
+NOISE_STD = 2.0
+"""`normalise_local_contrast` adds the square of this number of grey levels to the variance of each
+window, so that noise is not amplified in flat windows. Chosen by hand."""
 
 SQUARES, STEP_PX = 8, WINDOW_PX // 3
 """Number of squares of the chessboard along the longer side of a large image, and distance between
@@ -156,6 +161,54 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
         return scaled_homography(correction.astype(np.float64), 1 / scale, 1 / scale)
 
     return align
+
+
+def fit_homography_irls(
+    points0: np.ndarray, points1: np.ndarray, scale_px: float = 1.0
+) -> np.ndarray | None:
+    """Fit a homography to (N, 2) points by iteratively reweighted least squares (Cauchy weights).
+
+    A point with a residual of `scale_px` has half the weight of one without. Returns None if the
+    points determine no homography. The last element of the result is 1.
+    """
+    middle = points0.mean(axis=0)
+    spread = float(np.abs(points0 - middle).mean())
+    if not spread > 0:
+        return None
+    inwards = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, spread]]) / spread
+    first, second = ((points - middle) / spread for points in (points0, points1))
+    homography = np.eye(3)
+    for _ in range(IRLS_ITERATIONS):
+        depth = first @ homography[2, :2] + 1
+        mapped = transform_points(first, homography)
+        gaps = second - mapped
+        weight = 1 / (1 + (gaps**2).sum(axis=1) * (spread / scale_px) ** 2)
+        position = np.column_stack([first, np.ones(len(first))]) / depth[:, None]
+        zeros = np.zeros_like(position)
+        across = np.column_stack([position, zeros, -mapped[:, :1] * position[:, :2]])
+        down = np.column_stack([zeros, position, -mapped[:, 1:] * position[:, :2]])
+        normal = (across.T * weight) @ across + (down.T * weight) @ down
+        right = (across.T * weight) @ gaps[:, 0] + (down.T * weight) @ gaps[:, 1]
+        try:
+            step = np.linalg.solve(normal, right)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(step).all():
+            return None
+        homography = homography + np.append(step, 0).reshape(3, 3)
+        if np.abs(step).max() < 1e-9:
+            break
+    homography = np.linalg.inv(inwards) @ homography @ inwards
+    return homography / homography[2, 2]
+
+
+def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
+    """Subtract each window's mean and divide by its standard deviation; return (H, W) float32."""
+    window = (WINDOW_PX, WINDOW_PX)
+    values = gray.astype(np.float32)
+    mean = cv2.boxFilter(values, cv2.CV_32F, window)
+    variance = cv2.boxFilter(values * values, cv2.CV_32F, window) - mean * mean
+    return (values - mean) / np.sqrt(np.maximum(variance, 0) + NOISE_STD**2)
 
 
 def _halves(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
