@@ -58,7 +58,7 @@ def test_a_pose_does_not_depend_on_how_starts_are_rounded(turned: Any, few: Matc
         if tuple(at) in either
     ]
     assert len(gaps) > 0.9 * len(pixels)
-    assert np.median(gaps) < 0.02
+    assert np.median(gaps) < 0.005
 
 
 def test_points_lie_where_their_pixels_look(

@@ -38,8 +38,8 @@ AFFINITY_REGULARIZATION = 20.0
 """When an affinity is fitted to the matches in a window, the similarity of all matches counts as
 much as this number of matches, in case the matches are few or on one line. Chosen by hand."""
 
-MAX_SIMILARITY_SAMPLES = 5000
-"""The similarity is estimated from at most this number of matches, to save time."""
+MAX_SIMILARITY_SAMPLES, SIMILARITY_ITERATIONS = 5000, 20
+"""The similarity is fitted to at most this number of matches, in this number of steps."""
 
 CORNER_WINDOW_PX = 7
 """Strengths of corners are measured in a window with this side, about the side of a patch."""
@@ -85,14 +85,14 @@ def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarr
 def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     """Return rotation times scale, (2, 2), of a similarity fitted robustly to all matches."""
     every = -(-len(points0) // MAX_SIMILARITY_SAMPLES)
-    first, second = (
-        np.ascontiguousarray(points[::every], np.float64) for points in (points0, points1)
-    )
-    if len(first) < 3:
-        return np.eye(2)
-    matrix, _ = cv2.estimateAffinePartial2D(first, second, method=cv2.LMEDS)
-    usable = matrix is not None and np.isfinite(matrix).all() and (matrix[:, :2] != 0).any()
-    return matrix[:, :2] if usable else np.eye(2)
+    z0, z1 = (points[::every].astype(np.float64) @ [1, 1j] for points in (points0, points1))
+    weights, factor = np.ones(len(z0)), 1 + 0j
+    # The sum of distances has one minimum, so that few other matches change little.
+    for _ in range(SIMILARITY_ITERATIONS if len(z0) >= 3 else 0):
+        first, second = (z - np.average(z, weights=weights) for z in (z0, z1))
+        factor = np.vdot(first * weights, second) / max(np.vdot(first * weights, first).real, 1e-9)
+        weights = 1 / np.maximum(np.abs(second - factor * first), 1e-3)
+    return np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
 
 
 def local_affinities(
