@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -49,7 +50,7 @@ class KernelOptimizer(Optimizer):
     tensors only, so that safetensors can store it, and a resumed run is bit-identical.
     """
 
-    def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 1e-3) -> None:
+    def __init__(self, parameters: Iterable[Any], lr: float = 1e-3) -> None:
         super().__init__(parameters, {"lr": lr})
 
     @torch.no_grad()

@@ -111,8 +111,8 @@ def train_on_pairs(
         output: folder for checkpoint.safetensors, the best weights (best.npz for a ranker, a
             safetensors and an ONNX file otherwise), MODEL_CARD.md and the training curves.
         options: the recipe.
-        init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file.
-            None: random weights by the seed.
+        init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file,
+            or with `crops` also EdgePoint2's L64.pth. None: random weights by the seed.
         readings: folder of the readings of teachers, for a descriptor with `crops` only.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
         num_workers: number of processes that generate pairs; with 0, the training process does it.

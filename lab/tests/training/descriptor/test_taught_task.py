@@ -11,11 +11,12 @@ import torch
 from safetensors.torch import load_file
 
 from deepdetect import OptionError
+from deepdetect.io.image import find_images
 from deepdetect_lab.networks.export import to_onnx
 from deepdetect_lab.networks.weights import load_network
-from deepdetect_lab.training import DescriptorTrainingOptions, train_on_pairs
+from deepdetect_lab.training import DescriptorTrainingOptions, DeviceOptions, train_on_pairs
+from deepdetect_lab.training.descriptor.edge import BACKBONE, EdgeNetwork
 from deepdetect_lab.training.descriptor.losses import KINDS
-from deepdetect_lab.training.descriptor.taught import TaughtNetwork
 from deepdetect_lab.training.descriptor.taught_task import TaughtTrainer
 from deepdetect_lab.training.trainer import CHECKPOINT, TrainingResult
 
@@ -39,7 +40,7 @@ def test_an_interrupted_run_ends_with_the_same_weights(
     textures: Path, made_readings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = run(textures, made_readings, tmp_path / "whole")
-    counted = [f"{kind} correct" for kind in KINDS] + ["edgepoint score", "aliked score"]
+    counted = [f"{kind} correct" for kind in KINDS] + ["teachers score", "teachers found"]
     assert whole.best["score"] == pytest.approx(np.mean([whole.best[name] for name in counted]))
     assert "MIT" in (tmp_path / "whole/MODEL_CARD.md").read_text("utf-8")
     calls, step = iter(range(2)), TaughtTrainer.training_step
@@ -56,8 +57,8 @@ def test_an_interrupted_run_ends_with_the_same_weights(
     assert run(textures, made_readings, tmp_path / "parts").points == whole.points
     first, second = (load_file(tmp_path / name / CHECKPOINT) for name in ("whole", "parts"))
     assert all(torch.equal(first[name], second[name]) for name in first)
-    again: Any = load_network(whole.weights, TaughtNetwork)
-    assert isinstance(again, TaughtNetwork)
+    again: Any = load_network(whole.weights, EdgeNetwork)
+    assert isinstance(again, EdgeNetwork)
 
 
 def test_crops_need_readings(textures: Path, tmp_path: Path) -> None:
@@ -65,9 +66,35 @@ def test_crops_need_readings(textures: Path, tmp_path: Path) -> None:
         train_on_pairs(textures, textures, tmp_path, OPTIONS)
 
 
+def test_a_run_starts_from_the_published_layers(
+    textures: Path, made_readings: Path, l64: Path
+) -> None:
+    images = find_images(textures)
+    where = DeviceOptions(device="cpu")
+    trainer = TaughtTrainer(images, images, OPTIONS, l64, where, made_readings)
+    expected = EdgeNetwork()
+    expected.start_from(l64)
+    started = [name for name, _ in expected.named_parameters() if name.startswith(BACKBONE)]
+    for name in started:
+        assert torch.equal(trainer.network.get_parameter(name), expected.get_parameter(name))
+    rates = {
+        parameter: group["rate_factor"]
+        for optimizer in trainer.optimizers
+        for group in optimizer.param_groups
+        for parameter in group["params"]
+    }
+    names = "block_eighth.first.weight", "input.weight", "at_half.weight", "input.bias"
+    found = [rates[trainer.network.get_parameter(name)] for name in names]
+    assert found == [0.5, 1, 0.2, 0.4]
+    trainer.steps = 1000
+    rate = trainer.options.learning_rate
+    found = [trainer.learning_rate(step) / rate for step in (0, 160, 590, 1000)]
+    assert found == pytest.approx([1 / 150, 1, 0.5, 0])
+
+
 def test_an_onnx_file_gives_the_same_numbers() -> None:
     torch.manual_seed(0)
-    network = TaughtNetwork().eval()
+    network = EdgeNetwork().eval()
     example = {"luma": torch.zeros(1, 1, 128, 256), "xy": torch.ones(1, 5, 2)}
     example["sizes"] = torch.ones(1, 5)
     axes = {name: {1: "keypoints"} for name in ("xy", "sizes", "codes", "scores", "directions")}

@@ -5,14 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from tests.command_line import run_command
 
+from deepdetect import OptionError
 from deepdetect.io.image import find_images, load_image, luma
 from deepdetect_lab.training.teachers import readings
 from deepdetect_lab.training.teachers.readings import (
     POINTS,
     STRONG_DENSITY,
+    Reading,
     Teachers,
+    Whitening,
     choose_points,
     load_reading,
     read_photograph,
@@ -61,6 +65,34 @@ def test_an_interrupted_reading_is_resumed(
     for values, expected in zip(stored, known, strict=True):
         np.testing.assert_array_equal(values, expected)
         assert values.dtype == expected.dtype
+
+
+def test_whitening_makes_variances_more_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(readings, "SOME_POINTS", POINTS)
+    deviations = np.full(192, 0.1)
+    deviations[64:] = np.linspace(0.1, 0.4, 128)
+    rng = np.random.default_rng(0)
+    codes = 1 + rng.normal(size=(20_000, 192)) * deviations
+    none = dict.fromkeys(Reading._fields, np.zeros(0))
+    np.savez(tmp_path / "0.npz", **none | {"codes": codes.astype(np.float16)})
+    whiten = Whitening([tmp_path / "0.npz"])
+    found = whiten(torch.from_numpy(codes))
+    torch.testing.assert_close(found.norm(dim=-1), torch.ones(len(found)))
+    torch.testing.assert_close(found.mean(0), torch.zeros(192), atol=0.01, rtol=0)
+    shares = found.square().split([64, 128], 1)
+    torch.testing.assert_close(shares[0].sum(1) / shares[1].sum(1), torch.full((20_000,), 0.36))
+    # Deviations to the power of 1 - 0.75: between axes that differ fourfold, a factor of 1.41.
+    after = found.std(0)[64:].numpy()
+    assert after[-16:].mean() / after[:16].mean() == pytest.approx(
+        (deviations[-16:].mean() / deviations[64:80].mean()) ** 0.25, rel=0.1
+    )
+
+
+def test_without_readings_there_is_nothing_to_whiten() -> None:
+    with pytest.raises(OptionError, match="read the teachers first"):
+        Whitening([])
 
 
 def test_the_commands_read_and_learn(

@@ -13,7 +13,7 @@ import torch
 from deepdetect._shared.errors import OptionError
 from deepdetect.geometry.transforms import transform_points
 
-from ..scenes import MARGIN_PX, ROTATED_SHARES, SCALE, UPRIGHT_DEVIATIONS, View
+from ..scenes import MARGIN_PX, SCALE, UPRIGHT_DEVIATIONS, View
 from ..synthetic import WHITE, happens, rotation, view_homography
 from ..teachers.readings import Reading, load_reading, reading_file
 from .views import JITTER_PX, SIZE_ERRORS, photograph_view
@@ -22,6 +22,10 @@ CROP_PX, CROP_POINTS = 384, 384
 """Crops are three quarters as wide as the photographs, so that they show about as much around a
 point as the teachers saw. Each step draws 384 of the points that were read there, because the loss
 compares all with all."""
+
+TURNED_SHARE, CLEAN_SHARE = 0.15, 0.4
+"""Shares of the crops that are turned by any angle, and that show the photograph as it is. With
+more turned or changed ones, the codes of upright photographs were learned less well."""
 
 ATTEMPTS = 50
 """Photographs are drawn this often until one has been read: training may start before all are."""
@@ -34,7 +38,7 @@ class Crops(NamedTuple):
         images: (B, S, S) uint8 changed views, while the teachers read the unchanged photograph.
         positions: (B, N, 2) float32, in pixels.
         sizes: (B, N) float32 diameters, in pixels.
-        codes: (B, N, 192) float16 codes of the teachers.
+        codes: (B, N, 192) float16 codes of the teachers; in losses, float32 and whitened.
         survival: (B, N) float32, the share of the points of the photograph that ALIKED finds worse.
         turn: (B,) float32, the angle by which the photograph is turned, in radians.
     """
@@ -50,8 +54,8 @@ class Crops(NamedTuple):
 def draw_crop(rng: np.random.Generator, reading: Reading) -> Crops | None:
     """Draw a turned and zoomed crop of a photograph; return None if nothing was read there."""
     scale = math.exp(SCALE.strength(rng))
-    share, deviation = ROTATED_SHARES[0], UPRIGHT_DEVIATIONS[0]
-    angle = rng.uniform(-math.pi, math.pi) if happens(rng, share) else rng.normal(0, deviation)
+    turned = happens(rng, TURNED_SHARE)
+    angle = rng.uniform(-math.pi, math.pi) if turned else rng.normal(0, UPRIGHT_DEVIATIONS[0])
     size = np.array(reading.luma.shape[::-1])
     reach = np.maximum(0, size - scale * CROP_PX) / 2
     place = (size - 1) / 2 + rng.uniform(-reach, reach)
@@ -67,7 +71,9 @@ def draw_crop(rng: np.random.Generator, reading: Reading) -> Crops | None:
     sizes = reading.sizes[rows] / scale * np.exp(rng.normal(0, SIZE_ERRORS[0], CROP_POINTS))
     survival = reading.scores[:, 1].argsort(kind="stable").argsort()[rows] / len(reading.xy)
     places, sizes = places.astype(np.float32), sizes.astype(np.float32)
-    image, survival = photograph_view(rng, view), survival.astype(np.float32)
+    clean = happens(rng, CLEAN_SHARE)
+    image = (view * WHITE).clip(0, WHITE).astype(np.uint8) if clean else photograph_view(rng, view)
+    survival = survival.astype(np.float32)
     return Crops(image, places, sizes, reading.codes[rows], survival, np.float32(angle))
 
 

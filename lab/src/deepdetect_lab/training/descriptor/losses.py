@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from ..scenes import SIDE_PX
-from .network import DescriptorNetwork, turn
+from .network import KeypointNetwork, turn
 from .views import Pair
 
 NEAR_PX = 3.0
@@ -32,13 +32,13 @@ def kind_of(angle: float, zoom: float) -> str:
     return "upright" if angle < UPRIGHT else "turned"
 
 
-def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
+def describe_views(network: KeypointNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
     """Return descriptors (B, N, 64) of the keypoints of each view, without undoing any rotation."""
     first, second = network.code(*read_views(network, batch)).chunk(2)
     return first, second
 
 
-def read_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
+def read_views(network: KeypointNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
     """Return hidden units (2 * B * N, H) and positions (2 * B, N, 2) of the views' keypoints."""
     images = batch.images.transpose(0, 1).flatten(0, 1)
     positions = torch.cat([batch.positions0, batch.positions1])
@@ -46,7 +46,7 @@ def read_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]
     return network.features(maps_of(network, images), positions, sizes), positions
 
 
-def maps_of(network: DescriptorNetwork, images: Tensor) -> list[list[Tensor]]:
+def maps_of(network: KeypointNetwork, images: Tensor) -> list[list[Tensor]]:
     """Return the maps of images (B, S, S) uint8, computed in bfloat16."""
     values = images[:, None].float() / 255
     with torch.autocast(images.device.type, torch.bfloat16):
@@ -75,7 +75,7 @@ def mirror_half(batch: Pair, generator: np.random.Generator) -> Pair:
 
 
 def contrastive_loss(
-    network: DescriptorNetwork, batch: Pair, generator: np.random.Generator, counted: int = 1
+    network: KeypointNetwork, batch: Pair, generator: np.random.Generator, counted: int = 1
 ) -> Tensor:
     """Return the loss of `contrast` for a batch of pairs of which half are mirrored."""
     batch = mirror_half(batch, generator)
@@ -83,7 +83,7 @@ def contrastive_loss(
 
 
 def contrast(
-    network: DescriptorNetwork,
+    network: KeypointNetwork,
     views: tuple[Tensor, Tensor],
     batch: Pair,
     generator: np.random.Generator,
@@ -119,7 +119,7 @@ def _near(xy: Tensor) -> Tensor:
 
 @torch.no_grad()
 def shares_right(
-    network: DescriptorNetwork, batches: Iterable[Pair], counted: int = 1
+    network: KeypointNetwork, batches: Iterable[Pair], counted: int = 1
 ) -> dict[str, float]:
     """Return the share of keypoints whose mutual nearest neighbour is correct, by kind of pair.
 

@@ -10,7 +10,6 @@ image (`deepdetect.features.learned`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import reduce
 from typing import cast
 
@@ -20,28 +19,9 @@ from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, 
 
 from deepdetect.features.learned import CONSTANT, FREQUENCIES, LENGTH
 
-
-@dataclass(frozen=True)
-class Widths:
-    """The size of a network.
-
-    Attributes:
-        half, quarter, eighth, sixteenth, coarsest: numbers of channels of the feature maps, from
-            1/2 to 1/32 of the size of the octave.
-        hidden: number of hidden units of the perceptron.
-        length: numbers of a descriptor, a multiple of 64.
-        every_map: sample all maps at keypoints, not only the three finest with context.
-    """
-
-    half: int = 16
-    quarter: int = 32
-    eighth: int = 64
-    sixteenth: int = 96
-    coarsest: int = 128
-    hidden: int = 160
-    length: int = LENGTH
-    every_map: bool = True
-
+HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
+"""`HIDDEN` is the number of hidden units of the perceptron. The others are the numbers of channels
+of feature maps, from 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`)."""
 
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
@@ -104,31 +84,78 @@ class Halving(nn.Module):
         return self.second(self.first(x, octave), octave)
 
 
-class DescriptorNetwork(nn.Module):
-    """A network that describes keypoints in luma images whose sides are multiples of 128."""
+class KeypointNetwork(nn.Module):
+    """A network that reads feature maps at keypoints, and makes descriptors of what it reads.
 
-    def __init__(self, widths: Widths = Widths()) -> None:
-        super().__init__()
-        sizes = widths.half, widths.quarter, widths.eighth, widths.sixteenth, widths.coarsest
-        half, quarter, eighth, sixteenth, coarsest = sizes
-        self.at_half = Convolution(2, half, 4, 2)
-        self.at_quarter = Halving(half, quarter)
-        self.at_eighth = Halving(quarter, eighth)
-        self.at_sixteenth = Halving(eighth, sixteenth)
-        self.at_coarsest = Halving(sixteenth, coarsest)
-        self.to_sixteenth = nn.Conv2d(coarsest, sixteenth, 1)
-        self.around_sixteenth = Convolution(sixteenth, sixteenth)
-        self.to_eighth = nn.Conv2d(sixteenth, eighth, 1)
-        self.around_eighth = Convolution(eighth, eighth)
-        self.every_map, hidden = widths.every_map, widths.hidden
-        features = half + quarter + eighth + (eighth + sixteenth) * self.every_map
-        self.input = nn.Linear(2 * features, hidden)
+    Attributes:
+        octaves: number of octaves of which `maps` makes feature maps.
+        strides: distances between the values of each map of an octave, in its pixels.
+    """
+
+    octaves: int
+    strides: tuple[int, ...]
+
+    def add_perceptron(self, channels: int, hidden: int, length: int) -> None:
+        """Add the layers that make descriptors of what the maps have at keypoints.
+
+        `channels` is the number of channels of all maps of an octave, `hidden` that of hidden
+        units, and `length` that of the numbers of a descriptor, a multiple of 64.
+        """
+        self.input = nn.Linear(2 * channels, hidden)
         self.by_size = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 2 * hidden))
         nn.init.zeros_(self.get_parameter("by_size.2.weight"))
         nn.init.zeros_(self.get_parameter("by_size.2.bias"))
         self.norm, self.middle_norm = nn.BatchNorm1d(hidden), nn.BatchNorm1d(hidden)
-        self.middle, self.output = nn.Linear(hidden, hidden), nn.Linear(hidden, widths.length)
+        self.middle, self.output = nn.Linear(hidden, hidden), nn.Linear(hidden, length)
         self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # of the loss
+
+    def maps(self, luma: Tensor) -> list[list[Tensor]]:
+        """Return the feature maps of each octave."""
+        raise NotImplementedError
+
+    def code(self, features: Tensor, xy: Tensor) -> Tensor:
+        """Return (B, N, D) descriptors from hidden units (B * N, H) at keypoints (B, N, 2)."""
+        return normalize(self.output(features), dim=1).unflatten(0, xy.shape[:2])
+
+    def features(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
+        """Return (B * N, H) hidden units at keypoints, of which the descriptors are made."""
+        octaves = [
+            torch.cat(
+                [
+                    read_map(features, (xy + 0.5) / (stride << octave) - 0.5)
+                    for features, stride in zip(maps[octave], self.strides, strict=True)
+                ],
+                2,
+            )
+            for octave in range(self.octaves)
+        ]
+        shares = shares_of_octaves(sizes, self.octaves)
+        own_octave = reduce(torch.add, map(torch.mul, octaves, shares))
+        features = self.input(torch.cat([octaves[0], own_octave], 2)).flatten(0, 1)
+        seen = size_features(sizes).flatten(0, 1)
+        gain, shift = self.by_size(seen).chunk(2, 1)
+        features = relu(self.norm(features) * (1 + gain) + shift)
+        return relu(self.middle_norm(self.middle(features)))
+
+
+class DescriptorNetwork(KeypointNetwork):
+    """A network that describes keypoints in luma images whose sides are multiples of 128."""
+
+    octaves = OCTAVES
+    strides = (2, 4, 8, 8, 16)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.at_half = Convolution(2, HALF, 4, 2)
+        self.at_quarter = Halving(HALF, QUARTER)
+        self.at_eighth = Halving(QUARTER, EIGHTH)
+        self.at_sixteenth = Halving(EIGHTH, SIXTEENTH)
+        self.at_coarsest = Halving(SIXTEENTH, COARSEST)
+        self.to_sixteenth = nn.Conv2d(COARSEST, SIXTEENTH, 1)
+        self.around_sixteenth = Convolution(SIXTEENTH, SIXTEENTH)
+        self.to_eighth = nn.Conv2d(SIXTEENTH, EIGHTH, 1)
+        self.around_eighth = Convolution(EIGHTH, EIGHTH)
+        self.add_perceptron(HALF + QUARTER + 2 * EIGHTH + SIXTEENTH, HIDDEN, LENGTH)
 
     def forward(self, luma: Tensor, xy: Tensor, sizes: Tensor) -> Tensor:
         """Return (B, N, 64) descriptors of length 1 from luma (B, 1, H, W) in [0, 1].
@@ -140,8 +167,7 @@ class DescriptorNetwork(nn.Module):
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return five feature maps of each octave, at 1/2, 1/4, 1/8, 1/8 and 1/16 of its size.
 
-        The last two maps also contain context from coarser maps. Without `every_map`, these are
-        three maps: the first two, and the second one at 1/8.
+        The last two maps also contain context from coarser maps.
         """
         x, result = _normalized(luma), []
         for octave in range(OCTAVES):
@@ -155,44 +181,19 @@ class DescriptorNetwork(nn.Module):
             sixteenth = self.around_sixteenth(sixteenth + coarse, octave)
             coarse = double(self.to_eighth(sixteenth))
             around = self.around_eighth(eighth + coarse, octave)
-            every = [half, quarter, eighth, around, sixteenth]
-            result.append(every if self.every_map else [half, quarter, around])
+            result.append([half, quarter, eighth, around, sixteenth])
         return result
 
     def describe(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
         """Return (B, N, 64) descriptors at keypoints, from the feature maps of all octaves."""
         return self.code(self.features(maps, xy, sizes), xy)
 
-    def code(self, features: Tensor, xy: Tensor) -> Tensor:
-        """Return (B, N, 64) descriptors from hidden units (B * N, H) at keypoints (B, N, 2)."""
-        return normalize(self.output(features), dim=1).unflatten(0, xy.shape[:2])
 
-    def features(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
-        """Return (B * N, H) hidden units at keypoints, of which the descriptors are made."""
-        strides = (2, 4, 8, 8, 16) if self.every_map else (2, 4, 8)
-        octaves = [
-            torch.cat(
-                [
-                    read_map(features, (xy + 0.5) / (stride << octave) - 0.5)
-                    for features, stride in zip(maps[octave], strides, strict=True)
-                ],
-                2,
-            )
-            for octave in range(OCTAVES)
-        ]
-        own_octave = reduce(torch.add, map(torch.mul, octaves, shares_of_octaves(sizes)))
-        features = self.input(torch.cat([octaves[0], own_octave], 2)).flatten(0, 1)
-        seen = size_features(sizes).flatten(0, 1)
-        gain, shift = self.by_size(seen).chunk(2, 1)
-        features = relu(self.norm(features) * (1 + gain) + shift)
-        return relu(self.middle_norm(self.middle(features)))
-
-
-def shares_of_octaves(sizes: Tensor) -> tuple[Tensor, ...]:
+def shares_of_octaves(sizes: Tensor, octaves: int) -> tuple[Tensor, ...]:
     """Return the share of each octave, (B, N, 1), in what is read at keypoints of sizes (B, N)."""
     sizes = sizes.clamp(min=SMALLEST_SIZE_PX)
-    own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, OCTAVES - 1)[..., None]
-    shares = (1 - (own - torch.arange(OCTAVES, device=sizes.device)).abs()).clamp(min=0)
+    own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, octaves - 1)[..., None]
+    shares = (1 - (own - torch.arange(octaves, device=sizes.device)).abs()).clamp(min=0)
     return shares.split(1, -1)
 
 

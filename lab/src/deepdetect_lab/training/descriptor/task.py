@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from deepdetect.features.learned import CROSS_MODAL, LEARNED, angles_counted
@@ -22,7 +22,7 @@ from ..scenes import draw_until_seen
 from ..trainer import Trainer, digests, seeded, with_plateau
 from .export import export_descriptor
 from .losses import KINDS, contrastive_loss, kind_of, shares_right
-from .network import DescriptorNetwork
+from .network import DescriptorNetwork, KeypointNetwork
 from .views import Pair, draw_pair
 
 ONNX = "descriptor.onnx"
@@ -108,12 +108,13 @@ class DescriptorTrainer(Trainer):
         "shares"
     )
     weights_file = "descriptor.safetensors"
-    kind_of_network = DescriptorNetwork
+    kind_of_network: type[KeypointNetwork] = DescriptorNetwork
     no_kernels: tuple[str, ...] = ("at_half", "by_size")
     max_gradient_norm = 2.0
     average_decay = 0.998
-    network: DescriptorNetwork
-    average: DescriptorNetwork
+    decay_share = DECAY_SHARE
+    network: KeypointNetwork
+    average: KeypointNetwork
     window: Pair | None = None
 
     def __init__(
@@ -128,11 +129,7 @@ class DescriptorTrainer(Trainer):
         self.kind = CROSS_MODAL if options.cross_modal else LEARNED
         self.device = torch.device(device.accelerator)
         self.files = images
-        network: Any = (
-            seeded(self.kind_of_network, options.seed)
-            if init_weights is None
-            else load_network(init_weights, self.kind_of_network)
-        )
+        network: Any = self.first_network(init_weights)
         self.origin = digests(images, validation)
         self.origin["initial_weights"] = weights_digest(network)[:16]
         self.notes = {"images": str(len(self.files)), "run_on": str(self.device)}
@@ -143,16 +140,32 @@ class DescriptorTrainer(Trainer):
         self.network.train()
         # Muon suits layers between many features. AdamW trains the other parameters: the first
         # layer, the layers that take the keypoint's size or give few numbers, and vectors.
-        kernels: list[Any] = []
-        vectors: list[Any] = []
+        groups: dict[tuple[bool, float], list[Any]] = {}
         for name, parameter in self.network.named_parameters():
             kernel = parameter.ndim > 1 and not name.startswith(self.no_kernels)
-            (kernels if kernel else vectors).append(parameter)
-        group = {"params": vectors, "rate_factor": VECTOR_RATE}
-        adam = torch.optim.AdamW([group], betas=(0.9, 0.98), weight_decay=0, fused=True)
+            groups.setdefault((kernel, self.rate_factor(name)), []).append(parameter)
+        kernels, vectors = (
+            [
+                {"params": parameters, "rate_factor": factor * rate}
+                for (kernel, factor), parameters in groups.items()
+                if kernel == wanted
+            ]
+            for wanted, rate in ((True, 1.0), (False, VECTOR_RATE))
+        )
+        adam = torch.optim.AdamW(vectors, betas=(0.9, 0.98), weight_decay=0, fused=True)
         self.optimizers = [Muon(kernels), adam]
         self.steps = options.steps
         self.milestones = milestones(options.steps, options.val_count)
+
+    def first_network(self, init_weights: str | Path | None) -> nn.Module:
+        """Return the network before the first step: random, or with given weights."""
+        if init_weights is None:
+            return seeded(self.kind_of_network, self.options.seed)
+        return load_network(init_weights, self.kind_of_network)
+
+    def rate_factor(self, name: str) -> float:
+        """Return the factor of the learning rate of a parameter."""
+        return 1.0
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
@@ -193,7 +206,9 @@ class DescriptorTrainer(Trainer):
     def learning_rate(self, step: int) -> float:
         """Return Muon's learning rate in a step: a warm-up, a plateau, a linear decay to 0."""
         warm_up = min(WARM_UP_STEPS, WARM_UP_SHARE * self.steps)
-        return self.options.learning_rate * with_plateau(step, self.steps, warm_up, DECAY_SHARE)
+        return self.options.learning_rate * with_plateau(
+            step, self.steps, warm_up, self.decay_share
+        )
 
     def validate(self, step: int) -> dict[str, float]:
         """Measure the averaged weights on the validation pairs."""

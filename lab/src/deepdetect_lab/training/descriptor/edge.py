@@ -1,0 +1,196 @@
+"""The network of a descriptor that published ones teach; it starts as EdgePoint2-L64 (MIT).
+
+From real pairs, EdgePoint2 knows changes of season and light that synthetic views do not teach. Its
+maps are read at keypoints instead of being made into a descriptor of every fourth pixel, which
+would take more time than the maps. From the same maps, the network says how well a candidate at a
+point would survive a change of light or view, and at which angle the point is described.
+"""
+
+from __future__ import annotations
+
+import pickle
+from functools import reduce
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, interpolate, pad, relu
+
+from deepdetect._shared.errors import MissingWeightsError, WeightsError
+
+from ..teachers.readings import CODE_LENGTHS
+from .network import KeypointNetwork, double, read_map, shares_of_octaves, size_features
+
+EDGE_CHANNELS = (8, 16, 48, 64)
+"""Numbers of channels at 1/2, 1/4, 1/8 and 1/32 of the size of an octave, as the published weights
+of EdgePoint2-L64 have them."""
+
+CONTEXT_CHANNELS, GROUP = 64, 16
+"""Channels of our map at 1/8, and those of a group in its convolution. Without groups the network
+would take 8 % more time, with 96 channels 6 %."""
+
+HIDDEN, CODE_LENGTH = 128, 128
+"""Hidden units of the perceptron, and numbers of a descriptor. With 160 hidden units, a descriptor
+would take 4 % more time."""
+
+SCORE_CHANNELS = 8
+"""Channels from which scores are computed at 1/4 of the size. At 1/2, they would take 3 ms more."""
+
+VARIANCE = 1e-5
+"""What is added to variances of images and of layers, as the published weights expect it."""
+
+BACKBONE = "at_half", "around_half", "block"
+"""How the names of EdgePoint2's layers begin."""
+
+PUBLISHED = {
+    "at_half": "block1.0.layer.0",
+    "around_half": "block1.1.layer.0",
+    "block_half.first": "block1.2.layer.0",
+    "block_half.second": "block1.2.layer.3",
+    "block_eighth.first": "block2.layer.0",
+    "block_eighth.second": "block2.layer.3",
+    "block_eighth.skip": "block2.skip",
+    "block_coarsest.first": "block3.layer.0",
+    "block_coarsest.second": "block3.layer.3",
+    "block_coarsest.skip": "block3.skip",
+}
+"""Names of our layers, and of the convolutions of EdgePoint2 with which they start. The next layer
+in a sequence `layer` is the batch normalisation of its result."""
+
+
+class Residual(nn.Module):
+    """Two convolutions whose result is added to the input, or to a linear map of it."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.skip = nn.Identity() if inputs == outputs else nn.Conv2d(inputs, outputs, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return relu(self.second(relu(self.first(x))) + self.skip(x))
+
+
+class Halved(nn.Module):
+    """A residual block whose result has half of the width and the height.
+
+    EdgePoint2 computes the sum at every pixel, and takes the mean of each 2x2 pixels after ReLU. To
+    take the mean before it saves a tenth of the network's time and costs nothing.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 4, 2, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return relu(self.second(relu(self.first(x))) + avg_pool2d(x, 2))
+
+
+class EdgeNetwork(KeypointNetwork):
+    """A network that describes, scores and turns keypoints, and predicts the codes of its teachers.
+
+    It takes luma images whose sides are multiples of 64. EdgePoint2's batch normalisation is folded
+    into its layers.
+    """
+
+    octaves = 2
+    strides = (4, 8)
+
+    def __init__(self) -> None:
+        super().__init__()
+        half, quarter, eighth, coarsest = EDGE_CHANNELS
+        context = CONTEXT_CHANNELS
+        self.at_half = nn.Conv2d(1, half, 4, 2, 1)
+        self.around_half = nn.Conv2d(half, quarter, 3, padding=1)
+        self.block_half = Halved(quarter)
+        self.block_eighth = Residual(quarter, eighth)
+        self.block_coarsest = Residual(eighth, coarsest)
+        self.to_eighth = nn.Conv2d(coarsest, context, 1, bias=False)
+        self.own_eighth = nn.Conv2d(eighth, context, 1)
+        groups = context // GROUP
+        self.around_eighth = nn.Conv2d(context, context, 3, padding=1, groups=groups)
+        self.add_perceptron(quarter + context, HIDDEN, CODE_LENGTH)
+        self.score_quarter = nn.Conv2d(quarter, SCORE_CHANNELS, 1)
+        self.score_eighth = nn.Conv2d(context, SCORE_CHANNELS, 1)
+        self.score_output = nn.Conv2d(SCORE_CHANNELS, 2, 1)
+        self.score_size = nn.Linear(3, 1)
+        self.angle = nn.Linear(HIDDEN, 2)
+        self.teach = nn.Linear(CODE_LENGTH, sum(CODE_LENGTHS))
+
+    def forward(self, luma: Tensor, xy: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return descriptors (B, N, 128), scores (B, N), and directions (B, N, 2) of the angles.
+
+        The luma (B, 1, H, W) is in [0, 1]; positions (B, N, 2) and sizes (B, N) are in pixels.
+        """
+        maps = self.maps(luma)
+        features = self.features(maps, xy, sizes)
+        directions = self.angle(features).unflatten(0, xy.shape[:2])
+        return self.code(features, xy), self.scores(maps, xy, sizes), directions
+
+    def maps(self, luma: Tensor) -> list[list[Tensor]]:
+        """Return two feature maps of each octave, at 1/4 and 1/8 of its size.
+
+        The second one also contains context from a map at 1/32.
+        """
+        mean = luma.mean((2, 3), keepdim=True)
+        variance = (luma - mean).square().mean((2, 3), keepdim=True)
+        x, result = (luma - mean) * (variance + VARIANCE).rsqrt(), []
+        for octave in range(self.octaves):
+            if octave:
+                x = avg_pool2d(x, 2)
+            quarter = self.block_half(relu(self.around_half(relu(self.at_half(x)))))
+            eighth = self.block_eighth(avg_pool2d(quarter, 2))
+            coarse = self.to_eighth(self.block_coarsest(avg_pool2d(eighth, 4)))
+            coarse = interpolate(coarse, scale_factor=4, mode="bilinear", align_corners=False)
+            around = self.around_eighth(self.own_eighth(eighth) + coarse)
+            result.append([quarter, relu(around)])
+        return result
+
+    def scores(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
+        """Return scores (B, N), logits: the higher, the better a candidate survives changes."""
+        parts: list[Tensor] = []
+        for octave, (quarter, eighth) in enumerate(maps):
+            coarse = double(self.score_eighth(eighth.float()))
+            found = self.score_output(relu(self.score_quarter(quarter.float()) + coarse))
+            parts.append(read_map(found, (xy + 0.5) / (4 << octave) - 0.5))
+        shares = shares_of_octaves(sizes, self.octaves)
+        own = map(torch.mul, (part[..., 1:] for part in parts), shares)
+        fine, size = parts[0][..., :1], self.score_size(size_features(sizes))
+        result: Tensor = (fine + reduce(torch.add, own) + size)[..., 0]
+        return result
+
+    def start_from(self, path: Path) -> None:
+        """Take over the layers of EdgePoint2-L64, from the authors' file `L64.pth`.
+
+        Raises:
+            WeightsError: the file is missing or holds another network.
+        """
+        if not path.is_file():
+            raise MissingWeightsError(
+                f"there is no {path}: take L64.pth from github.com/HITCSC/EdgePoint2"
+            )
+        try:
+            stored = torch.load(path, "cpu", weights_only=True)
+            for name, published in PUBLISHED.items():
+                weight, bias = _folded(stored, published)
+                own = self.get_submodule(name)
+                if name == "block_half.second":  # the mean of 2x2 pixels, as one convolution
+                    moved = [pad(weight, (j, 1 - j, i, 1 - i)) for i in (0, 1) for j in (0, 1)]
+                    weight = torch.stack(moved).mean(0)
+                own.load_state_dict({"weight": weight, "bias": bias})
+        except (KeyError, RuntimeError, pickle.UnpicklingError):
+            raise WeightsError(f"{path} does not hold the weights of EdgePoint2-L64") from None
+
+
+def _folded(stored: dict[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
+    """Return kernels and bias of a convolution with the batch normalisation that follows it."""
+    weight = stored[f"{name}.weight"]
+    sequence, _, place = name.rpartition(".")
+    if not place.isdigit():
+        return weight, stored[f"{name}.bias"]
+    names = "weight", "bias", "running_mean", "running_var"
+    norm = f"{sequence}.{int(place) + 1}"
+    gain, shift, mean, variance = (stored[f"{norm}.{each}"] for each in names)
+    gain = gain * (variance + VARIANCE).rsqrt()
+    return weight * gain[:, None, None, None], shift - mean * gain
