@@ -86,11 +86,13 @@ def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     """Return rotation times scale, (2, 2), of a similarity fitted robustly to all matches."""
     every = -(-len(points0) // MAX_SIMILARITY_SAMPLES)
     z0, z1 = (points[::every].astype(np.float64) @ [1, 1j] for points in (points0, points1))
-    weights, factor = np.ones(len(z0)), 1 + 0j
+    weights, factor = np.ones(len(z0)), complex(1)
     # The sum of distances has one minimum, so that few other matches change little.
     for _ in range(SIMILARITY_ITERATIONS if len(z0) >= 3 else 0):
         first, second = (z - np.average(z, weights=weights) for z in (z0, z1))
-        factor = np.vdot(first * weights, second) / max(np.vdot(first * weights, first).real, 1e-9)
+        factor = complex(
+            np.vdot(first * weights, second) / (np.vdot(first * weights, first) + 1e-9)
+        )
         weights = 1 / np.maximum(np.abs(second - factor * first), 1e-3)
     return np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
 

@@ -112,12 +112,13 @@ class PlaneTracks:
         moved = transform_points(self._ends, matrix)
         self.points = scaled_points(self._starts, 1 / scale0), scaled_points(moved, 1 / scale1)
         self.homography = homography
-        correction = _fitted(self._starts, self._ends)
-        if correction is not None:
-            if self._validated():
-                refined = scaled_homography(matrix @ correction, 1 / scale0, 1 / scale1)
-                self.homography = refined / refined[2, 2]
-            self._ends = transform_points(self._ends, np.linalg.inv(correction))
+        correction = _fitted(self._starts, self._ends, NOISE_PX)
+        if correction is not None and self._validated():
+            refined = scaled_homography(matrix @ correction, 1 / scale0, 1 / scale1)
+            self.homography = refined / refined[2, 2]
+        sharp = _fitted(self._starts, self._ends, NOISE_PX / 2)
+        if sharp is not None:
+            self._ends = transform_points(self._ends, np.linalg.inv(sharp))
 
     def _validated(self) -> bool:
         """Return whether a fit to half of the squares brings no fewer others to the plane."""
@@ -125,7 +126,7 @@ class PlaneTracks:
         black = (starts // (self._side / SQUARES)).sum(axis=1) % 2 == 1
         gain = -np.count_nonzero(_on_plane(starts, ends))
         for used in (black, ~black):
-            found = _fitted(starts[used], ends[used])
+            found = _fitted(starts[used], ends[used], NOISE_PX)
             if found is None:
                 return False
             gain += np.count_nonzero(_on_plane(transform_points(starts, found), ends) & ~used)
@@ -175,19 +176,17 @@ def _on_plane(expected: np.ndarray, ends: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(ends - expected, axis=1) < NOISE_PX)
 
 
-def _fitted(starts: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
+def _fitted(starts: np.ndarray, ends: np.ndarray, threshold_px: float) -> np.ndarray | None:
     """Return the homography of the plane with most tracks; None if there are too few."""
     if len(starts) < MIN_TRACKS:
         return None
-    options = GeometryOptions(inlier_threshold=NOISE_PX)
+    options = GeometryOptions(inlier_threshold=threshold_px)
     found = estimate_geometry(starts, ends, "homography", options=options).matrix
     if found is None:
         return None
     near = np.linalg.norm(ends - transform_points(starts, found), axis=1) < NOISE_PX / 2
-    if np.count_nonzero(near) < MIN_TRACKS:
-        return None
-    least_squares, _ = cv2.findHomography(starts[near], ends[near])
-    return None if least_squares is None else np.asarray(least_squares)
+    few = np.count_nonzero(near) < MIN_TRACKS
+    return None if few else cv2.findHomography(starts[near], ends[near])[0]
 
 
 def _tracked(first: np.ndarray, second: np.ndarray, matrix: np.ndarray, matches: Pair) -> Pair:

@@ -394,8 +394,9 @@ def _is_doubtful(flat: Layer, epipolar: Hypothesis) -> bool:
 
 def _wins(deep: Layer, flat: Layer, tracks: PlaneTracks, seed: int) -> bool:
     """Return whether a scene has depth: by parallax, or because the plane explains less of it."""
-    more = deep.evidence.windows >= MOST * flat.evidence.windows
-    return _is_deep(flat, tracks, seed) or (more and deep.evidence.share > flat.evidence.share)
+    if deep.evidence.windows < flat.evidence.windows / 2:
+        return False
+    return _is_deep(flat, tracks, seed) or deep.evidence.share > flat.evidence.share
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
