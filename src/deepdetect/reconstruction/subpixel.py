@@ -90,9 +90,8 @@ def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     # The sum of distances has one minimum, so that few other matches change little.
     for _ in range(SIMILARITY_ITERATIONS if len(z0) >= 3 else 0):
         first, second = (z - np.average(z, weights=weights) for z in (z0, z1))
-        factor = complex(
-            np.vdot(first * weights, second) / (np.vdot(first * weights, first) + 1e-9)
-        )
+        held = first * weights
+        factor = complex(np.vdot(held, second) / (np.vdot(held, first) + 1e-9))
         weights = 1 / np.maximum(np.abs(second - factor * first), 1e-3)
     return np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
 

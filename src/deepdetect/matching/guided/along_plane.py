@@ -185,8 +185,7 @@ def _fitted(starts: np.ndarray, ends: np.ndarray, threshold_px: float) -> np.nda
     if found is None:
         return None
     near = np.linalg.norm(ends - transform_points(starts, found), axis=1) < NOISE_PX / 2
-    few = np.count_nonzero(near) < MIN_TRACKS
-    return None if few else cv2.findHomography(starts[near], ends[near])[0]
+    return cv2.findHomography(starts[near], ends[near])[0] if near.sum() >= MIN_TRACKS else None
 
 
 def _tracked(first: np.ndarray, second: np.ndarray, matrix: np.ndarray, matches: Pair) -> Pair:
