@@ -209,7 +209,7 @@ def test_a_dominant_plane_does_not_hide_the_depth_beside_it(
     assert guide.evidence.on_plane > times * guide.evidence.off_plane > 10_000
     pair = PosedPair("entry", first, second)
     errors = epipolar_errors(matches.points0, matches.points1, pair.fundamental)
-    assert (errors < 3).mean() > 0.98
+    assert (errors < 3).mean() > 0.99
     pose = estimate_pose(matches.points0, matches.points1, first.intrinsics, second.intrinsics)
     assert pose is not None
     assert translation_error(pose[1], pair.translation) < 1

@@ -13,7 +13,6 @@ plane", 2005). Lens distortion, wind and wrong tracks displace places in any dir
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -116,6 +115,7 @@ class PlaneTracks:
         if correction is not None and self._validated():
             refined = scaled_homography(matrix @ correction, 1 / scale0, 1 / scale1)
             self.homography = refined / refined[2, 2]
+        # Parallax is seen best from the plane that fits most sharply.
         sharp = _fitted(self._starts, self._ends, NOISE_PX / 2)
         if sharp is not None:
             self._ends = transform_points(self._ends, np.linalg.inv(sharp))
@@ -132,15 +132,10 @@ class PlaneTracks:
             gain += np.count_nonzero(_on_plane(transform_points(starts, found), ends) & ~used)
         return bool(gain >= 0)
 
-    @cached_property
-    def _moved(self) -> tuple[np.ndarray, np.ndarray]:
-        """Places, one per square, and their displacements from the plane, (N, 2) each."""
-        _, one = np.unique((self._starts // CELL_PX).astype(int), axis=0, return_index=True)
-        return self._starts[one], (self._ends - self._starts)[one]
-
     def parallax(self, seed: int = 0) -> Parallax:
         """Return how the places off the plane move."""
-        places, moved = self._moved
+        _, one = np.unique((self._starts // CELL_PX).astype(int), axis=0, return_index=True)
+        places, moved = self._starts[one], (self._ends - self._starts)[one]
         length = np.linalg.norm(moved, axis=1)
         off = length > NOISE_PX
         if np.count_nonzero(off) < 3:

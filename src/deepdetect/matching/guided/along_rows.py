@@ -165,6 +165,7 @@ def match_by_rectification(
                 fundamental = refine_fundamental((sparse, tracks[0]), fundamental, sizes)
     if _agreement(view, sparse) < MIN_AGREEMENT:
         return None
+    # If the rows still do not fit the matrix, only matches that geometry relies on are kept.
     near = row_error * view.scale < MAX_ROW_ERROR_PX
     samples = [_sample(view, xy0, relied_only=not near)]
     fine = _finer_view(grays, sparse, fundamental, plane, view)
