@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +9,12 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from deepdetect import OptionError
+from deepdetect import OptionError, PointDetector
 from deepdetect.io.image import find_images
-from deepdetect_lab.networks.export import to_onnx
 from deepdetect_lab.networks.weights import load_network
 from deepdetect_lab.training import DescriptorTrainingOptions, DeviceOptions, train_on_pairs
 from deepdetect_lab.training.descriptor.edge import BACKBONE, EdgeNetwork
+from deepdetect_lab.training.descriptor.export import export_descriptor
 from deepdetect_lab.training.descriptor.losses import KINDS
 from deepdetect_lab.training.descriptor.taught_task import TaughtTrainer
 from deepdetect_lab.training.trainer import CHECKPOINT, TrainingResult
@@ -59,6 +58,8 @@ def test_an_interrupted_run_ends_with_the_same_weights(
     assert all(torch.equal(first[name], second[name]) for name in first)
     again: Any = load_network(whole.weights, EdgeNetwork)
     assert isinstance(again, EdgeNetwork)
+    points = PointDetector(64, descriptor=tmp_path / "whole/descriptor.onnx")
+    assert points.extract(find_images(textures)[0]).descriptors.shape == (64, 64)
 
 
 def test_crops_need_readings(textures: Path, tmp_path: Path) -> None:
@@ -92,19 +93,23 @@ def test_a_run_starts_from_the_published_layers(
     assert found == pytest.approx([1 / 150, 1, 0.5, 0])
 
 
-def test_an_onnx_file_gives_the_same_numbers() -> None:
+def test_an_onnx_file_gives_the_same_numbers(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    network = EdgeNetwork().eval()
-    example = {"luma": torch.zeros(1, 1, 128, 256), "xy": torch.ones(1, 5, 2)}
-    example["sizes"] = torch.ones(1, 5)
-    axes = {name: {1: "keypoints"} for name in ("xy", "sizes", "codes", "scores", "directions")}
-    model = to_onnx(network, example, "codes scores directions", {"luma": {2: "h", 3: "w"}, **axes})
-    written = io.BytesIO(model.SerializeToString()).getvalue()
-    session = onnxruntime.InferenceSession(written, providers=["CPUExecutionProvider"])
+    network = EdgeNetwork()
+    with torch.no_grad():
+        for norm in (network.norm, network.middle_norm):
+            for values in (norm.weight, norm.bias, norm.running_mean, norm.running_var):
+                assert values is not None
+                values.uniform_(0.5, 2)
+    network.eval()
+    export_descriptor(network, tmp_path / "descriptor.onnx")
+    session = onnxruntime.InferenceSession(
+        tmp_path / "descriptor.onnx", providers=["CPUExecutionProvider"]
+    )
     luma, xy, sizes = torch.rand(1, 1, 256, 256), torch.rand(1, 40, 2) * 255, torch.rand(1, 40) * 30
     with torch.no_grad():
         expected = network(luma, xy, sizes)
     inputs = {"luma": luma.numpy(), "xy": xy.numpy(), "sizes": sizes.numpy()}
-    for found, known in zip(session.run(None, inputs), expected, strict=True):
-        np.testing.assert_allclose(found, known.numpy(), atol=1e-4)
-    assert expected[0].shape == (1, 40, 128)
+    (found,) = session.run(None, inputs)
+    np.testing.assert_allclose(found, expected.numpy(), atol=5e-3)  # kernels are float16
+    assert expected.shape == (1, 40, 64)

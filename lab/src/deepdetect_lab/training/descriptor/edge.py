@@ -3,7 +3,7 @@
 From real pairs, EdgePoint2 knows changes of season and light that synthetic views do not teach. Its
 maps are read at keypoints instead of being made into a descriptor of every fourth pixel, which
 would take more time than the maps. From the same maps, the network says how well a candidate at a
-point would survive a change of light or view, and at which angle the point is described.
+point would survive a change of light or view.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, relu
 
 from deepdetect._shared.errors import MissingWeightsError, WeightsError
+from deepdetect.features.learned import LENGTH
 
 from ..teachers.readings import CODE_LENGTHS
 from .network import KeypointNetwork, double, read_map, shares_of_octaves, size_features
@@ -29,9 +30,8 @@ CONTEXT_CHANNELS, GROUP = 64, 16
 """Channels of our map at 1/8, and those of a group in its convolution. Without groups the network
 would take 8 % more time, with 96 channels 6 %."""
 
-HIDDEN, CODE_LENGTH = 128, 128
-"""Hidden units of the perceptron, and numbers of a descriptor. With 160 hidden units, a descriptor
-would take 4 % more time."""
+HIDDEN = 128
+"""Hidden units of the perceptron. With 160, a descriptor would take 4 % more time."""
 
 SCORE_CHANNELS = 8
 """Channels from which scores are computed at 1/4 of the size. At 1/2, they would take 3 ms more."""
@@ -88,13 +88,13 @@ class Halved(nn.Module):
 
 
 class EdgeNetwork(KeypointNetwork):
-    """A network that describes, scores and turns keypoints, and predicts the codes of its teachers.
+    """A network that describes and scores keypoints, and predicts the codes of its teachers.
 
-    It takes luma images whose sides are multiples of 64. EdgePoint2's batch normalisation is folded
-    into its layers.
+    It takes luma images whose sides are multiples of 128. EdgePoint2's batch normalisation is
+    folded into its layers.
     """
 
-    octaves = 2
+    octaves = 3
     strides = (4, 8)
 
     def __init__(self) -> None:
@@ -110,23 +110,12 @@ class EdgeNetwork(KeypointNetwork):
         self.own_eighth = nn.Conv2d(eighth, context, 1)
         groups = context // GROUP
         self.around_eighth = nn.Conv2d(context, context, 3, padding=1, groups=groups)
-        self.add_perceptron(quarter + context, HIDDEN, CODE_LENGTH)
+        self.add_perceptron(quarter + context, HIDDEN)
         self.score_quarter = nn.Conv2d(quarter, SCORE_CHANNELS, 1)
         self.score_eighth = nn.Conv2d(context, SCORE_CHANNELS, 1)
         self.score_output = nn.Conv2d(SCORE_CHANNELS, 2, 1)
         self.score_size = nn.Linear(3, 1)
-        self.angle = nn.Linear(HIDDEN, 2)
-        self.teach = nn.Linear(CODE_LENGTH, sum(CODE_LENGTHS))
-
-    def forward(self, luma: Tensor, xy: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return descriptors (B, N, 128), scores (B, N), and directions (B, N, 2) of the angles.
-
-        The luma (B, 1, H, W) is in [0, 1]; positions (B, N, 2) and sizes (B, N) are in pixels.
-        """
-        maps = self.maps(luma)
-        features = self.features(maps, xy, sizes)
-        directions = self.angle(features).unflatten(0, xy.shape[:2])
-        return self.code(features, xy), self.scores(maps, xy, sizes), directions
+        self.teach = nn.Linear(LENGTH, sum(CODE_LENGTHS))
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return two feature maps of each octave, at 1/4 and 1/8 of its size.

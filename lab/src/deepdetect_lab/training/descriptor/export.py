@@ -2,30 +2,39 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import torch
+from torch import nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from deepdetect._shared.atomic import atomic_path
 from deepdetect.detector.points.descriptor import STRIDE
 from deepdetect.features.learned import LEARNED
 
 from ...networks.export import to_onnx
-from .network import DescriptorNetwork
+from .network import KeypointNetwork
 
 MIN_HALVED = 1000
 """Kernels with more values than this are stored as float16, which halves the file. The graph
 converts them to float32 before it computes with them."""
 
 
-def export_descriptor(network: DescriptorNetwork, path: Path, kind: str = LEARNED) -> None:
+def export_descriptor(network: KeypointNetwork, path: Path, kind: str = LEARNED) -> None:
     """Write a network as an ONNX file for `PointDetector(descriptor=...)`.
 
     `DESCRIPTOR_GRAPHS` lists the inputs and outputs. `kind` is the type of the descriptors.
     """
+    network = copy.deepcopy(network).eval()
+    for linear, norm in (("input", "norm"), ("middle", "middle_norm")):
+        layers: Any = [network.get_submodule(name) for name in (linear, norm)]
+        setattr(network, linear, fuse_linear_bn_eval(*layers))
+        setattr(network, norm, nn.Identity())
     luma = torch.zeros(1, 1, STRIDE, 2 * STRIDE)
     inputs = {"luma": luma, "xy": torch.ones(1, 50, 2), "sizes": torch.ones(1, 50)}
     axes = {name: {1: "keypoints"} for name in ("xy", "sizes", "descriptors")}

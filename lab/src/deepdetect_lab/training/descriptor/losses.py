@@ -34,16 +34,12 @@ def kind_of(angle: float, zoom: float) -> str:
 
 def describe_views(network: KeypointNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
     """Return descriptors (B, N, 64) of the keypoints of each view, without undoing any rotation."""
-    first, second = network.code(*read_views(network, batch)).chunk(2)
-    return first, second
-
-
-def read_views(network: KeypointNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
-    """Return hidden units (2 * B * N, H) and positions (2 * B, N, 2) of the views' keypoints."""
     images = batch.images.transpose(0, 1).flatten(0, 1)
     positions = torch.cat([batch.positions0, batch.positions1])
     sizes = torch.cat([batch.sizes0, batch.sizes1])
-    return network.features(maps_of(network, images), positions, sizes), positions
+    features = network.features(maps_of(network, images), positions, sizes)
+    first, second = network.code(features, positions).chunk(2)
+    return first, second
 
 
 def maps_of(network: KeypointNetwork, images: Tensor) -> list[list[Tensor]]:
@@ -68,35 +64,19 @@ def mirror(batch: Pair, which: Tensor) -> Pair:
     )
 
 
-def mirror_half(batch: Pair, generator: np.random.Generator) -> Pair:
-    """Mirror half of the pairs of a batch, at random."""
-    mirrored = torch.from_numpy(generator.random(len(batch.turn)) < 0.5)
-    return mirror(batch, mirrored.to(batch.turn.device))
-
-
 def contrastive_loss(
     network: KeypointNetwork, batch: Pair, generator: np.random.Generator, counted: int = 1
 ) -> Tensor:
-    """Return the loss of `contrast` for a batch of pairs of which half are mirrored."""
-    batch = mirror_half(batch, generator)
-    return contrast(network, describe_views(network, batch), batch, generator, counted)
-
-
-def contrast(
-    network: KeypointNetwork,
-    views: tuple[Tensor, Tensor],
-    batch: Pair,
-    generator: np.random.Generator,
-    counted: int = 1,
-) -> Tensor:
     """Return the symmetric InfoNCE loss, the cross-entropy of the true match among all keypoints.
 
-    The descriptors of the second view are rotated back by `counted`
+    Half of the pairs are mirrored. The descriptors of the second view are rotated back by `counted`
     (see `angles_counted`) times the rotation between the views at each keypoint, with random errors
     like those of a detector. Half of the pairs that are rotated by less than `UPRIGHT` are not
     rotated back, because in use upright images are described without rotation.
     """
-    device, (first, second) = batch.turns.device, views
+    mirrored = torch.from_numpy(generator.random(len(batch.turn)) < 0.5)
+    batch = mirror(batch, mirrored.to(batch.turn.device))
+    device, (first, second) = batch.turns.device, describe_views(network, batch)
     kept = torch.from_numpy(generator.random(len(batch.turn)) < 0.5).to(device)
     noise = torch.from_numpy(generator.normal(0, ANGLE_NOISE, batch.turns.shape)).to(device)
     as_is = kept & (batch.turn < UPRIGHT)

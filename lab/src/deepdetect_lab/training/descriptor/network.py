@@ -95,26 +95,33 @@ class KeypointNetwork(nn.Module):
     octaves: int
     strides: tuple[int, ...]
 
-    def add_perceptron(self, channels: int, hidden: int, length: int) -> None:
+    def add_perceptron(self, channels: int, hidden: int) -> None:
         """Add the layers that make descriptors of what the maps have at keypoints.
 
         `channels` is the number of channels of all maps of an octave, `hidden` that of hidden
-        units, and `length` that of the numbers of a descriptor, a multiple of 64.
+        units.
         """
         self.input = nn.Linear(2 * channels, hidden)
         self.by_size = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 2 * hidden))
         nn.init.zeros_(self.get_parameter("by_size.2.weight"))
         nn.init.zeros_(self.get_parameter("by_size.2.bias"))
         self.norm, self.middle_norm = nn.BatchNorm1d(hidden), nn.BatchNorm1d(hidden)
-        self.middle, self.output = nn.Linear(hidden, hidden), nn.Linear(hidden, length)
+        self.middle, self.output = nn.Linear(hidden, hidden), nn.Linear(hidden, LENGTH)
         self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # of the loss
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return the feature maps of each octave."""
         raise NotImplementedError
 
+    def forward(self, luma: Tensor, xy: Tensor, sizes: Tensor) -> Tensor:
+        """Return (B, N, 64) descriptors of length 1 from luma (B, 1, H, W) in [0, 1].
+
+        Positions (B, N, 2) and sizes (B, N) of the keypoints are in pixels.
+        """
+        return self.code(self.features(self.maps(luma), xy, sizes), xy)
+
     def code(self, features: Tensor, xy: Tensor) -> Tensor:
-        """Return (B, N, D) descriptors from hidden units (B * N, H) at keypoints (B, N, 2)."""
+        """Return (B, N, 64) descriptors from hidden units (B * N, H) at keypoints (B, N, 2)."""
         return normalize(self.output(features), dim=1).unflatten(0, xy.shape[:2])
 
     def features(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
@@ -155,14 +162,7 @@ class DescriptorNetwork(KeypointNetwork):
         self.around_sixteenth = Convolution(SIXTEENTH, SIXTEENTH)
         self.to_eighth = nn.Conv2d(SIXTEENTH, EIGHTH, 1)
         self.around_eighth = Convolution(EIGHTH, EIGHTH)
-        self.add_perceptron(HALF + QUARTER + 2 * EIGHTH + SIXTEENTH, HIDDEN, LENGTH)
-
-    def forward(self, luma: Tensor, xy: Tensor, sizes: Tensor) -> Tensor:
-        """Return (B, N, 64) descriptors of length 1 from luma (B, 1, H, W) in [0, 1].
-
-        Positions (B, N, 2) and sizes (B, N) of the keypoints are in pixels.
-        """
-        return self.describe(self.maps(luma), xy, sizes)
+        self.add_perceptron(HALF + QUARTER + 2 * EIGHTH + SIXTEENTH, HIDDEN)
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return five feature maps of each octave, at 1/2, 1/4, 1/8, 1/8 and 1/16 of its size.
@@ -183,10 +183,6 @@ class DescriptorNetwork(KeypointNetwork):
             around = self.around_eighth(eighth + coarse, octave)
             result.append([half, quarter, eighth, around, sixteenth])
         return result
-
-    def describe(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
-        """Return (B, N, 64) descriptors at keypoints, from the feature maps of all octaves."""
-        return self.code(self.features(maps, xy, sizes), xy)
 
 
 def shares_of_octaves(sizes: Tensor, octaves: int) -> tuple[Tensor, ...]:
@@ -246,12 +242,8 @@ def read_map(features: Tensor, xy: Tensor) -> Tensor:
 
 
 def turn(descriptors: Tensor, angles: Tensor) -> Tensor:
-    """Rotate descriptors (..., 64) by angles (...) in radians, as `turn_descriptors` does.
-
-    Longer ones, of a multiple of 64 numbers, have as many times more numbers of each frequency.
-    """
-    times = descriptors.shape[-1] // LENGTH
-    turns = angles[..., None] * torch.from_numpy(FREQUENCIES.repeat(times)).to(angles)
-    constant, numbers = descriptors.tensor_split([times * CONSTANT], -1)
+    """Rotate descriptors (..., 64) by angles (...) in radians, as `turn_descriptors` does."""
+    turns = angles[..., None] * torch.from_numpy(FREQUENCIES).to(angles)
+    constant, numbers = descriptors.tensor_split([CONSTANT], -1)
     (real, imaginary), (c, s) = numbers.chunk(2, -1), (turns.cos(), turns.sin())
     return torch.cat([constant, c * real - s * imaginary, s * real + c * imaginary], -1)

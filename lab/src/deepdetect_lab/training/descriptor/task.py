@@ -216,6 +216,6 @@ class DescriptorTrainer(Trainer):
         return {"score": sum(shares.values()) / len(shares), **shares}
 
     def export(self, folder: Path) -> Path | None:
-        best: Any = load_network(folder / self.weights_file, DescriptorNetwork)
+        best: Any = load_network(folder / self.weights_file, self.kind_of_network)
         export_descriptor(best, folder / ONNX, self.kind)
         return folder / ONNX

@@ -18,7 +18,7 @@ from .crops import Crops, draw_crops
 from .edge import BACKBONE, EdgeNetwork
 from .losses import KINDS
 from .task import DescriptorTrainer, PairDataset, pairs_to_draw
-from .teaching import crop_losses, measure_teaching, pair_losses
+from .teaching import PAIR_WEIGHT, crop_losses, measure_teaching
 from .views import Pair
 
 BACKBONE_RATE = 0.5
@@ -64,11 +64,10 @@ class TaughtTrainer(DescriptorTrainer):
         "Share of the keypoints whose match, a mutual nearest neighbour, is correct within 3 px, "
         "for each kind of pairs of views of the validation images; mean cosine to the whitened "
         "codes of both teachers, share of the points whose predicted code is nearest to their own; "
-        "correlation of scores with the second teacher's; share of the keypoints whose angles "
-        "agree to 20 degrees; the score is the mean of the first five"
+        "correlation of scores with the second teacher's; the score is the mean of the first five"
     )
     kind_of_network = EdgeNetwork
-    no_kernels = ("at_half", "by_size", "score", "angle")
+    no_kernels = ("at_half", "by_size", "score")
     decay_share = DECAY_SHARE
     network: EdgeNetwork
     average: EdgeNetwork
@@ -120,8 +119,8 @@ class TaughtTrainer(DescriptorTrainer):
 
     def loss_of_pairs(self, pairs: Pair, generator: np.random.Generator) -> Tensor:
         crops = self.on_device(self.crops)
-        losses = pair_losses(self.network, pairs, generator) | crop_losses(self.network, crops)
-        return sum(losses.values(), next(iter(losses.values())).new_zeros(()))
+        losses = crop_losses(self.network, crops).values()
+        return sum(losses, PAIR_WEIGHT * super().loss_of_pairs(pairs, generator))
 
     def on_device(self, crops: Crops) -> Crops:
         """Return crops on the device, with whitened codes."""
@@ -132,10 +131,6 @@ class TaughtTrainer(DescriptorTrainer):
         """Measure the averaged weights on the validation pairs and crops."""
         shares = super().validate(step)
         crops = map(self.on_device, self.val_crops)
-        measures = shares | measure_teaching(self.average, crops, self.batches)
+        measures = shares | measure_teaching(self.average, crops)
         counted = [f"{kind} correct" for kind in KINDS] + ["teachers score", "teachers found"]
         return measures | {"score": sum(measures[name] for name in counted) / len(counted)}
-
-    def export(self, folder: Path) -> Path | None:
-        """The core reads no such network yet."""
-        return None

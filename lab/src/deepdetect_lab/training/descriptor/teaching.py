@@ -1,33 +1,29 @@
-"""The losses of a network that is taught: codes and order of the teachers, and its own angles."""
+"""The losses of a network that is taught: codes and order of the teachers, and pairs of views."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, kl_div, log_softmax, normalize
 
 from .crops import Crops
 from .edge import EdgeNetwork
-from .losses import contrast, maps_of, mirror_half, read_views
+from .losses import maps_of
 from .network import turn
-from .views import Pair
 
-CODE_WEIGHT, RELATION_WEIGHT, NEIGHBOUR_WEIGHT = 14.0, 45.0, 3.0
-"""Weights of 1 - cosine to the teachers' codes, of the squared differences of similarities within a
-photograph, and of the differences of which codes there are most similar. The contrastive loss of
-pairs has weight 1. With weights a third smaller, the share of the points of photos/val whose
-predicted code is nearest to their own rose by 0.001 in 1,000 steps, and with these and a falling
-rate by 0.005 in the next 1,200."""
+PAIR_WEIGHT, CODE_WEIGHT, RELATION_WEIGHT, NEIGHBOUR_WEIGHT = 3.0, 14.0, 45.0, 3.0
+"""Weights of the contrastive loss of pairs, of 1 - cosine to the teachers' codes, of the squared
+differences of similarities within a photograph, and of the differences of which codes there are
+most similar. With weight 1 of pairs, zoomed ones lost a third of their matches. With the other
+weights a third smaller, the share of the points of photos/val whose predicted code is nearest to
+their own rose by 0.001 in 1,000 steps, and with these and a falling rate by 0.005 in the next
+1,200."""
 
 SHARPNESS = 10.0
 """Similarities are multiplied by it before a softmax turns them into shares of neighbours, so that
 a similarity 0.1 below the highest counts a third as much. Chosen by hand."""
-
-RIGHT_COSINE = 0.94
-"""The cosine of 20 degrees, an error by which own-angle descriptors hardly lose matches."""
 
 
 def crop_losses(network: EdgeNetwork, crops: Crops) -> dict[str, Tensor]:
@@ -44,7 +40,6 @@ def crop_losses(network: EdgeNetwork, crops: Crops) -> dict[str, Tensor]:
         "own neighbours": NEIGHBOUR_WEIGHT
         * neighbours_differ(without_self(own), without_self(known)),
         "neighbours": NEIGHBOUR_WEIGHT * neighbours_differ(found @ theirs.transpose(1, 2), known),
-        "up": (1 - up_is_found(network, features, crops)).mean(),
         "survival": binary_cross_entropy_with_logits(scores, crops.survival),
     }
 
@@ -72,47 +67,15 @@ def neighbours_differ(found: Tensor, known: Tensor) -> Tensor:
     return kl_div(chances, wanted, reduction="batchmean", log_target=True)
 
 
-def up_is_found(network: EdgeNetwork, features: Tensor, crops: Crops) -> Tensor:
-    """Return (B, N) cosines of the errors of angles, if that of an upright photograph is 0."""
-    x, y = normalize(network.angle(features), dim=-1).view(*crops.sizes.shape, 2).unbind(-1)
-    return x * crops.turn.cos()[:, None] + y * crops.turn.sin()[:, None]
-
-
-def pair_losses(
-    network: EdgeNetwork, batch: Pair, generator: np.random.Generator
-) -> dict[str, Tensor]:
-    """Return the losses of pairs of views: their descriptors', and those of their angles."""
-    batch = mirror_half(batch, generator)
-    features, positions = read_views(network, batch)
-    first, second = network.code(features, positions).chunk(2)
-    agreement = angles_agree(network.angle(features).unflatten(0, positions.shape[:2]), batch)
-    return {
-        "pairs": contrast(network, (first, second), batch, generator),
-        "angles": (1 - agreement)[batch.valid].mean(),
-    }
-
-
-def angles_agree(directions: Tensor, batch: Pair) -> Tensor:
-    """Return (B, N) cosines of the errors of the rotations that angles of both views predict.
-
-    Directions (2 * B, N, 2) are vectors whose angle is that of a keypoint.
-    """
-    (x0, y0), (x1, y1) = (each.unbind(-1) for each in normalize(directions, dim=-1).chunk(2))
-    along, across = x0 * x1 + y0 * y1, x0 * y1 - y0 * x1
-    return along * batch.turns.cos() + across * batch.turns.sin()
-
-
 @torch.no_grad()
-def measure_teaching(
-    network: EdgeNetwork, crops: Iterable[Crops], pairs: Iterable[Pair]
-) -> dict[str, float]:
-    """Return how well an averaged network has learned, on validation crops and pairs.
+def measure_teaching(network: EdgeNetwork, crops: Iterable[Crops]) -> dict[str, float]:
+    """Return how well an averaged network has learned, on validation crops.
 
     The measures are the mean cosine to the teachers' codes, the share of points whose predicted
-    code is nearer to their own than to that of all other points, the correlation of scores with
-    ALIKED's order, and the share of keypoints whose predicted rotation is correct to 20 degrees.
+    code is nearer to their own than to that of all other points, and the correlation of scores with
+    ALIKED's order.
     """
-    cosines, nearest, correlations, right = [], [], [], []
+    cosines, nearest, correlations = [], [], []
     for batch in crops:
         maps = maps_of(network, batch.images)
         code = network.code(network.features(maps, batch.positions, batch.sizes), batch.positions)
@@ -124,11 +87,6 @@ def measure_teaching(
         for found, known in zip(scores, batch.survival, strict=True):
             ranks = found.argsort().argsort().float()
             correlations.append(torch.corrcoef(torch.stack([ranks, known]))[0, 1])
-    for pair in pairs:
-        features, positions = read_views(network, pair)
-        directions = network.angle(features).unflatten(0, positions.shape[:2])
-        agree = angles_agree(directions, pair) > RIGHT_COSINE
-        right.append(agree[pair.valid].float().mean())
-    names = "teachers score", "teachers found", "order score", "angles correct"
-    means = (torch.stack(values).mean() for values in (cosines, nearest, correlations, right))
+    names = "teachers score", "teachers found", "order score"
+    means = (torch.stack(values).mean() for values in (cosines, nearest, correlations))
     return dict(zip(names, map(float, means), strict=True))
