@@ -4,38 +4,22 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Matches, PointDetector, match_features, match_images
-from deepdetect._shared.errors import ReconstructionError
-from deepdetect.geometry.camera import Calibration, Camera
+from deepdetect import Matches, estimate_pose
+from deepdetect._shared.errors import NoDepthError, ReconstructionError
+from deepdetect._shared.progress import StageTimer
+from deepdetect.geometry.camera import Calibration
 from deepdetect.geometry.estimation import TwoViewModel
-from deepdetect.geometry.relative_pose import estimate_relative_pose
-from deepdetect.geometry.two_view import fit_model, has_foreground, is_planar
-from deepdetect.io.image import load_image
+from deepdetect.geometry.two_view import fit_model, is_planar
 from deepdetect.reconstruction.subpixel import refine_matches
-from deepdetect.reconstruction.two_view import check_focal, check_matches, check_pose
-
-from .conftest import halved
+from deepdetect.reconstruction.two_view import MAX_SCENE_DISTANCE_PX, NO_DEPTH, checked_pose
 
 SIZE = (370, 250)
-
-
-def sparse(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    detector = PointDetector(2000, descriptor="rootsift")
-    found = match_features(*(detector.extract(image) for image in (first, second)))
-    return found.points0, found.points1
-
-
-def refusal(points: tuple[np.ndarray, ...], **known: Any) -> str:
-    with pytest.raises(ReconstructionError) as error:
-        check_matches(*points, SIZE, **known)
-    return str(error.value)
 
 
 def scaled(calibration: Calibration, factor: float) -> Calibration:
@@ -53,78 +37,21 @@ def refined(turned: Any, turned_matches: Matches) -> tuple[np.ndarray, np.ndarra
     return points0[converged][::3], points1[converged][::3]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("guide", ["auto", "fundamental"])
-def test_a_camera_that_only_rotated(
-    level: Any, only_turned: np.ndarray, guide: str, one_line
-) -> None:
-    found = match_images(level.left, only_turned, DeepDetect("dense"), model=guide)
-    points = found.points0, found.points1
-    camera = level.calibration.camera0
-    assert "rotation" in refusal(points, calibration=Calibration(camera, camera))
-    assert "plane" in refusal(points)
-
-
-def test_a_plane(photo: np.ndarray) -> None:
-    warp = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 18.0], [4e-4, 1e-4, 1.0]])
-    seen = cv2.warpPerspective(photo, warp, (256, 256), flags=cv2.INTER_CUBIC)
-    calibration = Calibration(*[Camera((256, 256), 300)] * 2)
-    assert "homography" in refusal(sparse(photo, seen), calibration=calibration)
-
-
-@pytest.mark.parametrize("other", [2, 4])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "bark",
-        pytest.param("bikes", marks=pytest.mark.slow),
-        pytest.param("leuven", marks=pytest.mark.slow),
-        pytest.param("wall", marks=pytest.mark.slow),
-    ],
-)
-def test_planar_photographs(shared: Path, name: str, other: int) -> None:
-    images = [
-        halved(load_image(shared / "data" / "oxford" / name / f"img{number}.png"))
-        for number in (1, other)
-    ]
-    assert "homography" in refusal(sparse(*images))
-
-
-def test_unrelated_photographs() -> None:
-    data = pytest.importorskip("skimage.data")
-    first, second = (
-        np.ascontiguousarray(image[:250, :370]) for image in (data.astronaut(), data.coffee())
-    )
-    at_random = tuple(np.random.default_rng(0).uniform(0, SIZE, (2, 2000, 2)))
-    for points in (sparse(first, second), at_random):
-        assert "overlap" in refusal(points)
-
-
-def test_no_overlap(level: Any) -> None:
-    """Opposite quarters of one scene."""
-    points = sparse(level.left[:125, :185], level.right[125:, 185:])
-    assert "overlap" in refusal(points)
-    refusal(tuple(np.empty((2, 0, 2))))
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "cones",
-        "teddy",
-        pytest.param("art", marks=pytest.mark.slow),
-        pytest.param("dolls", marks=pytest.mark.slow),
-        pytest.param("moebius", marks=pytest.mark.slow),
-        pytest.param("rocks", marks=pytest.mark.slow),
-        pytest.param("cloth", marks=pytest.mark.slow),
-    ],
-)
-def test_scenes_with_depth_pass(shared: Path, name: str) -> None:
-    folder = shared / "data" / "middlebury" / name
-    points = sparse(*(load_image(folder / f"{side}.png") for side in ("left", "right")))
-    _, epipolar = check_matches(*points, SIZE)
-    assert epipolar.inliers.mean() > 0.8
-    assert epipolar.log10_nfa < -50
+@pytest.mark.parametrize("scene", ["rotation", "planar", "still", "none"])
+def test_scenes_without_depth_are_refused_in_their_own_words(level: Any, scene: str) -> None:
+    first, camera = level.left, level.calibration.camera0.matrix
+    turn = camera @ cv2.Rodrigues(np.radians([3, -8, 4.0]))[0] @ np.linalg.inv(camera)
+    tilt = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 18.0], [4e-4, 1e-4, 1.0]])
+    size, noise = first.shape[1::-1], np.random.default_rng(0).integers(0, 255, first.shape)
+    others = {
+        "rotation": cv2.warpPerspective(first, turn, size, flags=cv2.INTER_CUBIC),
+        "planar": cv2.warpPerspective(first, tilt, size, flags=cv2.INTER_CUBIC),
+        "still": first,
+        "none": noise.astype(np.uint8),
+    }
+    with pytest.raises(NoDepthError) as error:
+        estimate_pose(first, others[scene], calibration=level.calibration)
+    assert str(error.value) == NO_DEPTH[scene]
 
 
 def test_a_good_pair_passes_with_its_pose_and_focal_length(turned: Any, refined: Any) -> None:
@@ -133,10 +60,9 @@ def test_a_good_pair_passes_with_its_pose_and_focal_length(turned: Any, refined:
 
 
 def check_all(points: Any, calibration: Calibration) -> None:
-    cells, epipolar = check_matches(*points, SIZE, calibration)
-    pose = check_pose(estimate_relative_pose(*points, calibration), cells, epipolar, calibration)
-    used = cells[epipolar.inliers]
-    check_focal(points[0][used], points[1][used], pose.errors[used], calibration)
+    fundamental = fit_model(*points, "fundamental", SIZE, MAX_SCENE_DISTANCE_PX).matrix
+    assert fundamental is not None
+    checked_pose(*points, fundamental, calibration, 0, StageTimer())
 
 
 @pytest.mark.parametrize("factor", [0.2, 0.3, 0.5])
@@ -164,16 +90,6 @@ def test_too_long_a_focal_length_is_seen_where_the_camera_turned_more(
         return
     with pytest.raises(ReconstructionError):
         check_all(points, calibration)
-
-
-def test_what_stands_in_front_of_a_plane() -> None:
-    """100 matches on the plane, 10 off it, some explained by the fundamental matrix."""
-    off_plane = np.append(np.ones(100), np.full(10, 20.0))
-    for explained, expected in ((10, True), (8, True), (7, False), (0, False)):
-        by_fundamental = np.ones(110, bool)
-        by_fundamental[100 + explained :] = False
-        assert has_foreground(off_plane, by_fundamental) == expected
-    assert not has_foreground(off_plane[:104], np.ones(104, bool))  # under 5 %
 
 
 @pytest.mark.parametrize("wrong", [0, 300])

@@ -91,10 +91,10 @@ class TwoViewGeometry:
         matrix: (3, 3) float64; None if the model is "none". A homography maps points of the first
             image to the second. Other matrices M satisfy x1^T M x0 = 0 for points x0 and x1 of the
             two images, in pixels or, for an essential matrix, in normalised coordinates.
-        scene: "planar", "rotation" (the camera only rotated; a flat scene may look the same),
-            "depth", "depth with a dominant plane", or "none" if the model is "none". If the cameras
-            are calibrated, matches of a planar scene leave two possible poses, and matches of a
-            rotation do not tell the translation.
+        scene: "still" (both images show the same view), "planar", "rotation" (the camera only
+            rotated; a flat scene may look the same), "depth", "depth with a dominant plane", or
+            "none" if the model is "none". If the cameras are calibrated, matches of a planar scene
+            leave two possible poses, and matches of a rotation do not tell the translation.
         confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" if the model
             is "none".
         evidence: the measurements on which the decision rests.

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from .camera import Size
-from .two_view import MIN_MATCHES
 
 DISTORTIONS = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3)
 """Distortions that are tried: the part of its distance by which a lens moves a corner inwards. At 1
@@ -26,6 +25,9 @@ MIN_FLAT_DEVIATIONS, MIN_FLAT_RATIO, NEAR = 15.0, 2 / 3, 3.0
 """A distorted homography fits a plane or a camera that turned better by this number of deviations,
 and fits at least this fraction of the matches that fit a pinhole's epipolar lines, within NEAR
 times `SCALE`. A curved cloth has 8 and 0.55; the fisheyes found have 20 to 70 and 0.7 to 0.9."""
+
+MIN_MATCHES = 30
+"""With fewer matches, no distortion is sought: by chance, a lens fits a few matches."""
 
 UNDISTORT = "undistort them with the lens's calibration (cv2.undistort, cv2.fisheye)"
 

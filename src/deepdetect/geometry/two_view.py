@@ -1,9 +1,4 @@
-"""Decide what two images show: a plane, a rotation, depth, the same view, or nothing in common.
-
-Matching, reconstruction and stitching all use this decision. A homography and a fundamental matrix
-are fitted to the same matches. The decision depends on their inliers, and on the parallax of the
-matches that the homography does not explain.
-"""
+"""Tell from matches what two images show: a plane, a rotation, or the same view."""
 
 from __future__ import annotations
 
@@ -11,7 +6,6 @@ import numpy as np
 
 from .camera import Calibration, Camera, Size
 from .estimation import (
-    MAX_LOG10_NFA,
     MIN_FRACTION_OF_PLANE,
     GeometryOptions,
     TwoViewModel,
@@ -20,18 +14,14 @@ from .estimation import (
     measure_parallax,
 )
 from .semi_calibrated import START_FOCAL_LENGTHS
-from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
 """Inlier thresholds in pixels of the models that guide matching. These models are fitted to less
 accurate keypoints, from reduced copies of the images."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
-"""Inlier thresholds in pixels of the models by which a scene is classified. Chosen on Oxford,
-Middlebury, Strecha's fountain and a KITTI clip."""
-
-MIN_MATCHES = 30
-"""A scene with fewer matches than this is not classified. Chosen like `SCENE_THRESHOLDS_PX`."""
+"""Inlier thresholds in pixels of the models by which a rectified pair or a turn of the camera is
+recognised. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_PLANAR_RATIO = 0.75
 """A scene is a plane only if the homography has at least this fraction of the number of inliers of
@@ -40,11 +30,6 @@ the fundamental matrix. Chosen like `SCENE_THRESHOLDS_PX`."""
 MAX_MEDIAN_MOTION_PX, MAX_MOTION_PX, MOTION_QUANTILE = 0.5, 3.0, 0.9
 """Two images show the same view only if the median of the distances that matches move is below the
 first, and their MOTION_QUANTILE below the second. Chosen like `SCENE_THRESHOLDS_PX`."""
-
-FOREGROUND_DISTANCE_PX, MIN_FOREGROUND_FRACTION, MIN_FOREGROUND_ON_LINES = 6.0, 0.05, 0.8
-"""A match is clearly off the plane if its transfer error is above the first. There is a foreground
-only if as many matches as the second fraction of the fundamental matrix's inliers are, and the
-third fraction of them are inliers, which is at most 0.65 on 16 planar pairs of Oxford."""
 
 
 def fit_model(
@@ -64,38 +49,6 @@ def fit_model(
     return TwoViewModel(model, geometry.matrix, geometry.inliers, alarms)
 
 
-def classify_scene(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    size1: Size,
-    calibration: Calibration | None,
-    seed: int,
-) -> tuple[str, TwoViewModel]:
-    """Classify a pair by (M, 2) matches that are spread out, and return its fundamental matrix.
-
-    The class is "unrelated" (no model explains enough matches), "static" (nothing moves),
-    "rotation" (the camera only rotated), "plane" (without a calibration also a rotation), or
-    "depth". Adjacent matches would not be independent evidence.
-    """
-    plane, epipolar = (
-        fit_model(points0, points1, model, size1, SCENE_THRESHOLDS_PX[model], seed)
-        for model in ("homography", "fundamental")
-    )
-    known = len(points0) >= MIN_MATCHES and epipolar.matrix is not None
-    if not known or min(plane.log10_nfa, epipolar.log10_nfa) > MAX_LOG10_NFA:
-        return "unrelated", epipolar
-    agreeing = plane.inliers | epipolar.inliers
-    if is_static(np.linalg.norm(points1 - points0, axis=1)[agreeing]):
-        return "static", epipolar
-    if plane.matrix is None or not is_planar(points0, points1, plane, epipolar, seed):
-        return "depth", epipolar
-    if has_foreground(transfer_errors(points0, points1, plane.matrix), epipolar.inliers):
-        return "depth", epipolar
-    on_plane = points0[plane.inliers], points1[plane.inliers]
-    rotated = calibration is not None and is_pure_rotation(*on_plane, calibration)
-    return "rotation" if rotated else "plane", epipolar
-
-
 def is_planar(
     points0: np.ndarray,
     points1: np.ndarray,
@@ -110,20 +63,6 @@ def is_planar(
     # `parallax.shows_depth` is not used: it counts all matches off the plane, also wrong ones.
     parallax = measure_parallax(points0, points1, plane.matrix, seed)
     return not parallax.exceeds(MIN_FRACTION_OF_PLANE)
-
-
-def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool:
-    """Return whether something stands in front of the plane, even if it is small.
-
-    Arguments are the (M,) transfer errors of the homography, and the fundamental matrix's inliers.
-    """
-    clear = off_plane_px > FOREGROUND_DISTANCE_PX
-    foreground = np.count_nonzero(clear & by_fundamental)
-    needed = max(
-        MIN_FOREGROUND_ON_LINES * np.count_nonzero(clear),
-        MIN_FOREGROUND_FRACTION * np.count_nonzero(by_fundamental),
-    )
-    return bool(foreground > 0 and foreground >= needed)
 
 
 def is_static(motion_px: np.ndarray) -> bool:

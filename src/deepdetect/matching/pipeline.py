@@ -17,7 +17,7 @@ from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
 from ..features.keypoints import Keypoints, nearest_keypoints
-from ..features.learned import LEARNED_RATIO, RATIO, is_learned, match_learned
+from ..features.learned import is_learned, match_learned, ratio_limit
 from ..features.match_filter import check_filter, filter_matches, require_suited
 from ..features.matchers import (
     DescriptorMatches,
@@ -151,7 +151,8 @@ def match_features(
             least nine mutual neighbours, learned descriptors (not cross-modal) or RootSIFT, and
             keypoints with sizes and angles.
         ratio: maximum ratio of the descriptor distances to the nearest and the second-nearest
-            neighbour. None: 0.85, or 0.88 for learned descriptors, which is as strict for them.
+            neighbour. None: 0.85, 0.92 for "learned", 0.88 for other learned descriptors, which is
+            as strict for each.
         mutual: keep only mutual nearest neighbours.
         seed: seed of a matcher that is random.
 
@@ -187,7 +188,7 @@ def match_features(
     if by_neighbours:
         require_suited(features0, features1)
     if ratio is None:
-        ratio = LEARNED_RATIO if learned else RATIO
+        ratio = ratio_limit(features0.descriptor_type)
     if not 0 < ratio <= 1:
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
     check_memory([len(features0), len(features1)])

@@ -41,7 +41,7 @@ from .rectification import (
     find_rectification,
 )
 from .result import Reconstruction
-from .two_view import checked_pose, reconstruct_two_view, refined_corners
+from .two_view import checked_pose, reconstruct_two_view, refined_corners, scene_with_depth
 
 SOR_WINDOW_PX = 9
 """Statistical outlier removal (SOR) compares a pixel of a rectified pair with the others in a
@@ -146,8 +146,6 @@ def reconstruct(
                 detector,
                 selection=whole,
                 ignore=tuple(masks),
-                # A homography would keep only the points on one plane.
-                model="fundamental",
                 seed=seed,
             )
         made = reconstruct_two_view(matches, grays, known, point_filter, seed, timer)
@@ -220,12 +218,12 @@ def estimate_pose(
             rgb[1],
             detector,
             ignore=masks,
-            model="fundamental",
             seed=seed,
         )
+    scene, fundamental = scene_with_depth(matches)
     with timer.stage("sub-pixel"):
-        corners = refined_corners(grays, matches.points0, matches.points1)
-    pose = checked_pose(*corners, known, seed, timer)
+        corners = refined_corners(grays, scene.points0, scene.points1)
+    pose = checked_pose(*corners, fundamental, known, seed, timer)
     left_out = 0.0 if matches.geometry is None else matches.geometry.evidence.left_out
     return replace(pose, left_out=left_out)
 

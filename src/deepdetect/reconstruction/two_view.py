@@ -18,9 +18,8 @@ from ..features.matches import Matches
 from ..features.selection import grid_subsample
 from ..geometry import epipolar_errors
 from ..geometry.camera import Calibration, Camera, fundamental_matrix
-from ..geometry.estimation import TwoViewModel
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose, triangulate
-from ..geometry.two_view import SCENE_THRESHOLDS_PX, classify_scene
+from ..geometry.two_view import SCENE_THRESHOLDS_PX
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners
 
@@ -49,12 +48,27 @@ GOOD_ERROR_PX = 0.1
 """No other focal length is tried if the given one has a median error below this. Chosen by hand."""
 
 NO_DEPTH = {
-    "static": "nothing moves between the images: depth needs two images from two places",
+    "none": "the matches agree with no geometry: the images do not overlap, show different scenes, "
+    "or have no pixel above the threshold (lower `threshold`, or give `density`)",
+    "still": "nothing moves between the images: depth needs two images from two places",
     "rotation": "a rotation explains all the matches: move the camera sideways between the images",
-    "plane": "one homography explains all the matches: the images show a plane, or the camera only "
-    "rotated, and there is no depth",
+    "planar": "one homography explains all the matches: the images show a plane, or the camera "
+    "only rotated, and there is no depth",
 }
-"""Error messages for the kinds of pairs that show no depth."""
+"""Error messages for the scenes (`TwoViewGeometry.scene`) that show no depth."""
+
+
+def scene_with_depth(matches: Matches) -> tuple[Matches, np.ndarray]:
+    """Return the matches of a scene and its (3, 3) fundamental matrix.
+
+    Raises a NoDepthError if the scene of guided matches shows no depth.
+    """
+    geometry = matches.geometry
+    assert geometry is not None
+    if geometry.scene in NO_DEPTH:
+        raise NoDepthError(NO_DEPTH[geometry.scene])
+    assert geometry.matrix is not None
+    return matches[matches.layer == 0], geometry.matrix
 
 
 def refined_corners(
@@ -76,11 +90,12 @@ def reconstruct_two_view(
     timer: StageTimer,
 ) -> dict[str, Any]:
     """Triangulate the matches of two uint8 luma images; return fields of `Reconstruction`."""
+    matches, guide = scene_with_depth(matches)
     points0, points1 = matches.points0.astype(np.float64), matches.points1.astype(np.float64)
     dropped: dict[str, int] = {}
     with timer.stage("sub-pixel"):
         corners = refined_corners(images, points0, points1)
-    pose = checked_pose(*corners, calibration, seed, timer)
+    pose = checked_pose(*corners, guide, calibration, seed, timer)
     baseline = 1.0 if calibration.baseline_mm is None else calibration.baseline_mm
     with timer.stage("triangulation"):
         shift = pose.translation * baseline
@@ -125,74 +140,45 @@ def reconstruct_two_view(
 def checked_pose(
     points0: np.ndarray,
     points1: np.ndarray,
+    fundamental: np.ndarray,
     calibration: Calibration,
     seed: int,
     timer: StageTimer,
 ) -> RelativePose:
-    """Estimate the pose from refined (M, 2) matches, or raise an error that says why it fails."""
-    with timer.stage("checks"):
-        cells, epipolar = check_matches(
-            points0, points1, calibration.camera1.size, calibration, seed
-        )
+    """Estimate the pose from refined (M, 2) matches, or raise an error that says why it fails.
+
+    The fundamental matrix, which does not depend on the calibration, explains the matches.
+    """
+    cells = grid_subsample(points0, GRID_SIZE_PX, seed)
+    errors = epipolar_errors(points0[cells], points1[cells], fundamental)
     with timer.stage("pose"):
         found = estimate_relative_pose(
             points0, points1, calibration, MAX_EPIPOLAR_DISTANCE_PX, seed
         )
-        pose = check_pose(found, cells, epipolar, calibration)
+        pose = check_pose(found, cells, errors < MAX_SCENE_DISTANCE_PX, calibration)
     with timer.stage("focal length"):
-        explained = cells[epipolar.inliers]
+        explained = cells[errors < MAX_SCENE_DISTANCE_PX]
         on_lines = points0[explained], points1[explained]
         check_focal(*on_lines, pose.errors[explained], calibration, seed)
     return pose
 
 
-def check_matches(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    size1: tuple[int, int],
-    calibration: Calibration | None = None,
-    seed: int = 0,
-) -> tuple[np.ndarray, TwoViewModel]:
-    """Raise a NoDepthError if (M, 2) matches show no overlap, no motion, or no depth.
-
-    One match from each cell of a grid is used. Returns their (K,) indices, and their fundamental
-    matrix. With a calibration, the message can tell a rotation from a plane.
-    """
-    if not len(points0):
-        raise NoDepthError(
-            "there are no matches: the images do not overlap, show different scenes, or have no "
-            "pixel above the threshold (lower `threshold`, or give `density`)"
-        )
-    indices = grid_subsample(points0, GRID_SIZE_PX, seed)
-    kind, epipolar = classify_scene(points0[indices], points1[indices], size1, calibration, seed)
-    if kind == "unrelated":
-        raise NoDepthError(
-            f"too few of the {len(points0):,} matches agree with one geometry: the images do not "
-            "overlap, or show different scenes"
-        )
-    if kind != "depth":
-        raise NoDepthError(NO_DEPTH[kind])
-    return indices, epipolar
-
-
 def check_pose(
-    pose: RelativePose | None,
-    indices: np.ndarray,
-    epipolar: TwoViewModel,
-    calibration: Calibration,
+    pose: RelativePose | None, cells: np.ndarray, explained: np.ndarray, calibration: Calibration
 ) -> RelativePose:
     """Return the pose of all matches, or raise a ReconstructionError if the calibration is wrong.
 
-    It then explains far fewer matches than `epipolar` of `check_matches`, with their `indices`.
+    It then explains far fewer of some matches, with the indices `cells` (K,), than the fundamental
+    matrix, which explains the (K,) bool `explained`.
     """
     wrong_focal = _wrong_focal(calibration)
     if pose is None:
         raise ReconstructionError(f"no pose fits the matches: {wrong_focal}")
-    possible = np.count_nonzero(epipolar.inliers)
-    explained = np.count_nonzero(pose.errors[indices] < MAX_SCENE_DISTANCE_PX)
-    if explained < MIN_POSE_RATIO * possible:
+    possible = np.count_nonzero(explained)
+    count = np.count_nonzero(pose.errors[cells] < MAX_SCENE_DISTANCE_PX)
+    if count < MIN_POSE_RATIO * possible:
         raise ReconstructionError(
-            f"only {explained:,} of {possible:,} matches fit one pose: {wrong_focal}"
+            f"only {count:,} of {possible:,} matches fit one pose: {wrong_focal}"
         )
     if pose.cheirality_ratio < MIN_IN_FRONT_FRACTION:
         raise ReconstructionError(

@@ -25,7 +25,7 @@ from deepdetect._shared.machine import map_in_processes
 from deepdetect._shared.progress import progress
 from deepdetect.detector.point_detector import PointDetector
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.features.learned import LEARNED, LEARNED_RATIO, RATIO, match_learned
+from deepdetect.features.learned import LEARNED, match_learned, ratio_limit
 from deepdetect.features.match_filter import AROUND, filter_inputs, nearest_rows
 from deepdetect.features.matchers import DescriptorMatches, exact_neighbours, match_descriptors
 from deepdetect.features.sift import ROOT_SIFT
@@ -333,9 +333,6 @@ class MatchFilterTrainer(Trainer):
         return folder / ONNX
 
 
-RATIOS = {LEARNED: LEARNED_RATIO, ROOT_SIFT: RATIO}
-"""Thresholds of the ratio test with which the filter is compared, for each descriptor."""
-
 WAYS = ("ratio test", "filter", "filter, as precise")
 MEASURES = ("right", "precision", "of unrelated views")
 
@@ -347,7 +344,7 @@ def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]
     The filter has two thresholds: logit 0, and one where it is as precise as the ratio test.
     """
     found, losses = {}, []
-    for offset, (name, limit) in enumerate(RATIOS.items()):
+    for offset, name in enumerate((LEARNED, ROOT_SIFT)):
         own = samples[offset::2]
         parts = [join([sample]) for sample in own]
         logits = torch.cat([network(*values) for values, _ in parts])
@@ -357,7 +354,7 @@ def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]
         numbers = torch.arange(offset, len(samples), 2).repeat_interleave(counts)
         unrelated, counted, right = numbers % UNRELATED == 0, known(errors), errors < RIGHT_PX
         losses.append((logits[counted], right[counted].float()))
-        by_ratio = ratios < limit
+        by_ratio = ratios < ratio_limit(name)
         precision = right[by_ratio & counted].float().mean()
         order = logits[counted].argsort(descending=True)
         share = right[counted][order].cumsum(0) / torch.arange(1, len(order) + 1)

@@ -65,7 +65,7 @@ def describe_learned(
     xy, sizes = (keypoints.xy + 0.5) * factor - 0.5, keypoints.sizes * factor.mean()
     angles = set_angles(gray, xy, sizes, keypoints.angles)
     below, right = -height % STRIDE, -width % STRIDE
-    padded = cv2.copyMakeBorder(gray, 0, below, 0, right, cv2.BORDER_REPLICATE)
+    padded = cv2.copyMakeBorder(gray, 0, below, 0, right, cv2.BORDER_REFLECT_101)
     luma = padded[None, None].astype(np.float32) / 255
     inputs = {"luma": luma, "xy": xy[None], "sizes": sizes[None]}
     path = DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor))

@@ -14,6 +14,7 @@ from ...features.matches import MAX_KEYPOINT_DISTANCE_PX, GuidedMatches, TwoView
 from ...features.matches import Evidence as PublicEvidence
 from ...features.matches import Layer as PublicLayer
 from ...geometry.camera import Size
+from ...geometry.estimation import log10_nfa
 from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.transforms import outer_corners, transfer_errors
@@ -38,8 +39,9 @@ matches, because those from one period of a pattern to another also lie on epipo
 explains less may leave out something that stands before it."""
 
 MAX_SPARSE_LOG10_NFA = -12.0
-"""Without dense matches, sparse ones are an answer if the log10 number of false alarms is below
-this."""
+"""Without dense matches, sparse ones are an answer if the log10 number of false alarms of those
+that move is below this. Those that stand still may come from the borders, which descriptors see, or
+from a frame."""
 
 OFF_RATIO = 4.0
 """Tentative matches with errors above this multiple of the inlier threshold are not explained."""
@@ -118,7 +120,7 @@ class Explanation:
             if found is not None and (
                 fallback is None or found.hypothesis.log10_nfa < fallback.hypothesis.log10_nfa
             ):
-                fallback, self._sources.hinted = found, True
+                fallback = found
         if not layers:
             return [] if fallback is None else [fallback]
         free = np.ones(len(tentative.points0), bool)
@@ -213,7 +215,7 @@ class Explanation:
             yield flat[0]
         nothing = free is None and flat is None and epipolar is None
         self.refuted = nothing and bool(refuted.any())
-        sparse = [each for each in sparse if each.log10_nfa < MAX_SPARSE_LOG10_NFA]
+        sparse = [each for each in sparse if self._nfa_of_moving(each) < MAX_SPARSE_LOG10_NFA]
         if not self.refuted and sparse and free is None:
             best = min(sparse, key=lambda each: each.log10_nfa)
             layer = self._sparse(best)
@@ -281,6 +283,14 @@ class Explanation:
         nothing = Evidence(np.full((1, 1), np.nan), 1.0, 1.0, nowhere, nowhere)
         return Layer(hypothesis, matches, nothing) if len(rows) >= MIN_MATCHES else None
 
+    def _nfa_of_moving(self, hypothesis: Hypothesis) -> float:
+        sizes, tentative = self._pair.sizes, hypothesis.tentative
+        motion = np.linalg.norm(tentative.points1 - tentative.points0, axis=1)
+        still_px = GUIDING_THRESHOLDS_PX["homography"] * tentative.pixel
+        moving = motion >= (still_px if sizes[0] == sizes[1] else 0)
+        inliers, threshold_px = hypothesis.inliers[moving], hypothesis.threshold_px
+        return log10_nfa(inliers, hypothesis.model, threshold_px, sizes[1])
+
     def _on_free(self, evidence: Evidence, free: np.ndarray | None) -> Evidence:
         if free is None:
             return evidence
@@ -341,9 +351,12 @@ class Explanation:
         some = np.random.default_rng(self._seed).permutation(len(points0))[:SCENE_MATCHES]
         ends = points0[some].astype(np.float64), points1[some]
         if geometry.model == "homography":
-            rotation = is_usual_rotation(*ends, self._pair.sizes)
+            scene = "rotation" if is_usual_rotation(*ends, self._pair.sizes) else "planar"
+            assert geometry.matrix is not None
+            if stands_still(geometry.matrix, self._pair.sizes):
+                scene = "still"
             evidence = replace(geometry.evidence, on_plane=len(points0))
-            return replace(geometry, scene="rotation" if rotation else "planar", evidence=evidence)
+            return replace(geometry, scene=scene, evidence=evidence)
         plane = fit_model(
             *ends,
             "homography",

@@ -17,7 +17,7 @@ import numpy as np
 from ...detector.point_detector import PointDetector
 from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
-from ...features.learned import CROSS_MODAL, LEARNED, LEARNED_RATIO, is_learned, match_learned
+from ...features.learned import CROSS_MODAL, LEARNED, is_learned, match_learned, ratio_limit
 from ...features.matchers import exact_neighbours, match_descriptors
 from ...geometry.semi_calibrated import estimate_semi_calibrated, refine_fundamental
 from ...geometry.transforms import epipolar_errors, scaled_points, transfer_errors
@@ -125,12 +125,7 @@ class Hypothesis:
 
 
 class Sources:
-    """Tentative matches of a pair, each source asked only once, and only when it is wanted.
-
-    Attributes:
-        hinted: set it when a source has found a geometry that the images do not yet confirm. More
-            points of the same kind may then help, those of other kinds are left out.
-    """
+    """Tentative matches of a pair, each source asked only once, and only when it is wanted."""
 
     def __init__(
         self,
@@ -139,7 +134,6 @@ class Sources:
         keypoints: tuple[Keypoints, Keypoints] | None = None,
     ) -> None:
         self._pair, self._given, self._keypoints = pair, given, keypoints
-        self.hinted = False
 
     def __iter__(self) -> Iterator[Tentative]:
         if self._given is not None:
@@ -147,11 +141,9 @@ class Sources:
         elif self._keypoints is not None:
             yield from self._of_points(self._keypoints)
         yield self.learned
-        if not self.hinted:
-            yield self._cross_modal()
+        yield self._cross_modal()
         yield self.dense
-        if not self.hinted:
-            yield self._views()
+        yield self._views()
 
     @cached_property
     def learned(self) -> Tentative:
@@ -173,11 +165,9 @@ class Sources:
             first, second = pool.map(extract, (0, 1))
         return first, second
 
-    def _matched(
-        self, points: tuple[Keypoints, Keypoints], side_px: int, ratio: float = LEARNED_RATIO
-    ) -> Tentative:
+    def _matched(self, points: tuple[Keypoints, Keypoints], side_px: int) -> Tentative:
         (scale0, scale1) = self._pair.both(side_px)[1]
-        points0, points1, _ = matched_points(*points, ratio)
+        points0, points1, _ = matched_points(*points)
         ends = scaled_points(points0, 1 / scale0), scaled_points(points1, 1 / scale1)
         return Tentative(*ends, 1 / scale1)
 
@@ -255,12 +245,11 @@ def _detector(max_keypoints: int) -> PointDetector:
     return PointDetector(max_keypoints, descriptor=LEARNED)
 
 
-def matched_points(
-    first: Keypoints, second: Keypoints, ratio: float = LEARNED_RATIO
-) -> tuple[np.ndarray, ...]:
+def matched_points(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
     """Match keypoints by descriptors; return positions in both images, and distance ratios."""
     assert first.descriptors is not None
     assert second.descriptors is not None
+    ratio = ratio_limit(first.descriptor_type)
     match = partial(match_descriptors, matcher=exact_neighbours, ratio=ratio, mutual=True)
     if is_learned(first.descriptor_type):
         matches = match_learned(first, second, match)

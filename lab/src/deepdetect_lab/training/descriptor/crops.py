@@ -14,7 +14,7 @@ from deepdetect._shared.errors import OptionError
 from deepdetect.geometry.transforms import transform_points
 
 from ..scenes import MARGIN_PX, SCALE, UPRIGHT_DEVIATIONS, View
-from ..synthetic import WHITE, happens, rotation, view_homography
+from ..synthetic import WHITE, Effect, happens, rotation, view_homography
 from ..teachers.readings import Reading, load_reading, reading_file
 from .views import JITTER_PX, SIZE_ERRORS, photograph_view
 
@@ -26,6 +26,10 @@ compares all with all."""
 TURNED_SHARE, CLEAN_SHARE = 0.15, 0.4
 """Shares of the crops that are turned by any angle, and that show the photograph as it is. With
 more turned or changed ones, the codes of upright photographs were learned less well."""
+
+FAR_SCALE = Effect(0.4, math.log(0.4), math.log(2.4))
+"""Share of the crops whose scale is not drawn from `SCALE` but from this wider range of its
+logarithm, so that the network learns the same codes at any scale."""
 
 ATTEMPTS = 50
 """Photographs are drawn this often until one has been read: training may start before all are."""
@@ -53,7 +57,7 @@ class Crops(NamedTuple):
 
 def draw_crop(rng: np.random.Generator, reading: Reading) -> Crops | None:
     """Draw a turned and zoomed crop of a photograph; return None if nothing was read there."""
-    scale = math.exp(SCALE.strength(rng))
+    scale = math.exp((FAR_SCALE if FAR_SCALE.happens(rng) else SCALE).strength(rng))
     turned = happens(rng, TURNED_SHARE)
     angle = rng.uniform(-math.pi, math.pi) if turned else rng.normal(0, UPRIGHT_DEVIATIONS[0])
     size = np.array(reading.luma.shape[::-1])

@@ -13,7 +13,7 @@ from .edge import EdgeNetwork
 from .losses import maps_of
 from .network import turn
 
-PAIR_WEIGHT, CODE_WEIGHT, RELATION_WEIGHT, NEIGHBOUR_WEIGHT = 3.0, 14.0, 45.0, 3.0
+PAIR_WEIGHT, CODE_WEIGHT, RELATION_WEIGHT, NEIGHBOUR_WEIGHT = 5.0, 14.0, 45.0, 3.0
 """Weights of the contrastive loss of pairs, of 1 - cosine to the teachers' codes, of the squared
 differences of similarities within a photograph, and of the differences of which codes there are
 most similar. With weight 1 of pairs, zoomed ones lost a third of their matches. With the other

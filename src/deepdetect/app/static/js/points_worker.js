@@ -32,6 +32,12 @@ async function candidatesOf({ gray, width, height }, limit, token) {
                  limit: ["int64", BigInt64Array.of(BigInt(limit)), [1]] });
 }
 
+/** Returns the place of a pixel outside an image in the image, which is reflected at its border. */
+function reflected(place, side) {
+  const within = place % Math.max(1, 2 * (side - 1));
+  return Math.min(within, Math.abs(2 * (side - 1) - within));
+}
+
 /** Returns upright descriptors of points, rows of 64 numbers. */
 async function uprightDescriptors({ gray, width, height, points: { xy, sizes } }, token) {
   const count = sizes.length;
@@ -41,8 +47,8 @@ async function uprightDescriptors({ gray, width, height, points: { xy, sizes } }
   const [across, down] = [width, height].map((side) => STRIDE * Math.ceil(side / STRIDE));
   const luma = new Float32Array(across * down);
   for (let y = 0, at = 0; y < down; y++) {
-    const start = Math.min(y, height - 1) * width;
-    for (let x = 0; x < across; x++) luma[at++] = gray[start + Math.min(x, width - 1)] / 255;
+    const start = reflected(y, height) * width;
+    for (let x = 0; x < across; x++) luma[at++] = gray[start + reflected(x, width)] / 255;
   }
   const { descriptors } = await model({
     luma: ["float32", luma, [1, 1, down, across]],
