@@ -13,6 +13,8 @@ from deepdetect.detector.points.detection import detect_points
 from deepdetect.detector.points.ranker import load_ranker
 from deepdetect.features.sift import scaled_sift_descriptors, to_root_sift
 
+UPRIGHT_WARP = np.array([[0.95, 0.04, 5.0], [-0.02, 0.97, 6.0], [2e-4, 1e-4, 1.0]])
+
 
 @pytest.fixture(scope="module")
 def image(photo: np.ndarray) -> np.ndarray:
@@ -153,3 +155,21 @@ def test_a_descriptor_of_ones_own_describes(image: np.ndarray) -> None:
     assert len(matches) == 50
     again = pickle.loads(pickle.dumps(points)).extract(image)
     np.testing.assert_array_equal(again.descriptors, found.descriptors)
+
+
+def test_upright_descriptors_keep_more_mutual_neighbours_of_upright_images(
+    photo: np.ndarray,
+) -> None:
+    other = cv2.warpPerspective(photo, UPRIGHT_WARP, photo.shape[1::-1], flags=cv2.INTER_CUBIC)
+    counts = []
+    for upright in (False, True):
+        points = PointDetector(500, upright=upright)
+        first, second = points.extract(photo), points.extract(other)
+        assert (first.angles == 0).all() == upright
+        found = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(
+            first.descriptors, second.descriptors
+        )
+        ends = cv2.perspectiveTransform(first.xy[None].astype(float), UPRIGHT_WARP)[0]
+        errors = [np.linalg.norm(ends[m.queryIdx] - second.xy[m.trainIdx]) for m in found]
+        counts.append(np.count_nonzero(np.array(errors) < 3))
+    assert counts[1] > 1.05 * counts[0]

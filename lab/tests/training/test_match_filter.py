@@ -10,10 +10,11 @@ import pytest
 import torch
 from skimage import data
 
+from deepdetect.features.learned import LEARNED
+from deepdetect.features.sift import ROOT_SIFT
 from deepdetect_lab.networks.weights import load_network
 from deepdetect_lab.training import MatchFilterTrainingOptions, match_filter
 from deepdetect_lab.training.match_filter import (
-    RATIOS,
     RIGHT_PX,
     UNRELATED,
     MatchFilter,

@@ -47,12 +47,15 @@ class PointDetector:
         spread: how keypoints are chosen if there are more than `max_keypoints`. "none" takes those
             ranked highest. "grid" takes the best of each cell of a grid, then the second-best of
             each, and so on. "anms" takes good ones that lie as far apart as their number allows.
+        upright: give all keypoints the angle 0, which keeps more matches of images that are not
+            rotated relative to each other. It is for programs that compare descriptors as they are,
+            such as `cv2.BFMatcher`; `match_features` does about as well without it.
         resolution: "auto" (images over two megapixels are scaled down to that) or "native" (images
             keep their size).
         ranker: npz file of the network that ranks the keypoints, written by `deepdetect dev
             train-points`. None: the bundled file.
         descriptor: what describes the keypoints. "learned" is a small network that also sees the
-            surroundings of a keypoint. "learned-free" is the same network, trained only on freely
+            surroundings of a keypoint. "learned-free" was trained only on freely
             licensed images. "cross-modal" is for images of different sensors, such as infrared and
             visible light, or for maps. "rootsift" is for programs that expect SIFT descriptors. A
             path is an ONNX file written by `deepdetect train-descriptor`. An object must have a
@@ -79,6 +82,7 @@ class PointDetector:
         max_keypoints: int | None = 2048,
         *,
         spread: Spread = "none",
+        upright: bool = False,
         resolution: Literal["auto", "native"] = "auto",
         ranker: str | Path | None = None,
         descriptor: str | Path | Descriptor = LEARNED,
@@ -105,7 +109,7 @@ class PointDetector:
             raise OptionError(f"`spread={spread!r}` needs `max_keypoints`, the number to spread")
         check_name("resolution of points", resolution, ("auto", "native"))
         self.max_keypoints = None if max_keypoints is None else int(max_keypoints)
-        self.spread, self.resolution = spread, resolution
+        self.spread, self.upright, self.resolution = spread, bool(upright), resolution
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         self._ranker = load_ranker(self.ranker)
         if isinstance(descriptor, Descriptor):
@@ -126,6 +130,7 @@ class PointDetector:
             "ranker": file_digest(self.ranker),
             "max_keypoints": self.max_keypoints,
             "spread": self.spread,
+            "upright": self.upright,
             "resolution": self.resolution,
         }
 
@@ -237,7 +242,7 @@ class PointDetector:
     def __repr__(self) -> str:
         return (
             f"PointDetector(max_keypoints={self.max_keypoints}, spread={self.spread!r}, "
-            f"resolution={self.resolution!r}, ranker={self.ranker.name}, "
+            f"upright={self.upright}, resolution={self.resolution!r}, ranker={self.ranker.name}, "
             f"descriptor={str(self.descriptor)!r})"
         )
 
@@ -262,6 +267,8 @@ class PointDetector:
             found = detect_points(
                 gray, most, spread=self.spread, ignore=ignore, ranker=self._ranker
             )
+        if self.upright:
+            found = replace(found, angles=np.zeros(len(found), np.float32))
         if size == whole:
             return found
         assert found.sizes is not None

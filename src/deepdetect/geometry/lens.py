@@ -27,7 +27,7 @@ and fits at least this fraction of the matches that fit a pinhole's epipolar lin
 times `SCALE`. A curved cloth has 8 and 0.55; the fisheyes found have 20 to 70 and 0.7 to 0.9."""
 
 MIN_MATCHES = 30
-"""With fewer matches, no distortion is sought: by chance, a lens fits a few matches."""
+"""No distortion is sought in fewer matches, because one may fit them by chance."""
 
 UNDISTORT = "undistort them with the lens's calibration (cv2.undistort, cv2.fisheye)"
 
