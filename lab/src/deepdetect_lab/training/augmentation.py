@@ -55,6 +55,10 @@ LIGHT = Light(
 CAMERA = Camera(blur=Effect(0.3, 0.5, 2.5), noise=(Effect(0.25, 1, 8),), jpeg=Effect(0.35, 20, 95))
 """Ranges of the changes of light and camera in augmented views. Chosen by hand; not measured."""
 
+READ_NOISE, SHOT_NOISE = (math.log(0.5), math.log(14.0)), (0.0, 1.0)
+"""Ranges of the noise of a sensor, in grey levels: the logarithm of its deviation in black, and the
+growth of its variance for each level. A phone at night has about 8 and 0.5."""
+
 MAX_JITTER_SATURATION = 1.2
 """A hue rotation also scales the saturation by a random factor up to this one. Chosen by hand."""
 
@@ -92,6 +96,15 @@ def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -
         return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
     angle = generator.uniform(0, 2 * np.pi)
     return rotate_hue(rgb, angle, generator.uniform(0, MAX_JITTER_SATURATION))
+
+
+def add_sensor_noise(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Add read and shot noise of a random sensor to (H, W, 3) uint8, grey in half of the cases."""
+    read, gain = math.exp(generator.uniform(*READ_NOISE)), generator.uniform(*SHOT_NOISE)
+    channels = int(generator.choice([1, 3]))
+    noise = generator.standard_normal((*rgb.shape[:2], channels), np.float32)
+    noisy = rgb + np.sqrt(read**2 + gain * rgb.astype(np.float32)) * noise
+    return np.clip(np.rint(noisy), 0, WHITE).astype(np.uint8)
 
 
 def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:

@@ -22,7 +22,7 @@ from deepdetect.io.image import load_image
 from deepdetect.io.masks import load_mask, save_mask
 
 from ..labels import LabelOptions
-from .augmentation import jitter_color, transpose
+from .augmentation import add_sensor_noise, jitter_color, transpose
 from .recipe import Stage, TrainingOptions
 from .sampler import CropIndex
 from .shards import Shards, ShardSource
@@ -176,6 +176,8 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
         if generator.random() < options.color_jitter:
             dark = view.darkening is not None
             image = jitter_color(image, generator, dark)
+        if generator.random() < options.sensor_noise:
+            image = add_sensor_noise(image, generator)
         return torch.tensor(image), torch.tensor(mask)
 
     def _choose_view(

@@ -90,6 +90,8 @@ class TrainingOptions:
             mirrored crop differently. Flips would also change labels of Shi-Tomasi, SIFT and ORB.
         color_jitter: fraction of the crops whose colours are removed or rotated. The luma, on which
             labels and `fast` depend, changes by at most one grey level.
+        sensor_noise: fraction of the crops that get the noise of a sensor, while their labels are
+            those of the view without it.
         optimizer: "adam", or "soap", which learns more per image (measurements: lab/HISTORY.md).
         learning_rate: learning rate at the start of cosine annealing, which ends at 1e-6.
         warm_up: fraction of the steps over which the learning rate rises from zero. It protects
@@ -126,6 +128,7 @@ class TrainingOptions:
     augmentations: int = 4
     transpositions: bool = True
     color_jitter: float = 0.0
+    sensor_noise: float = 0.0
     optimizer: str = "soap"
     learning_rate: float = 2e-3
     warm_up: float = 0.05
@@ -147,7 +150,7 @@ class TrainingOptions:
             self,
             positive=("learning_rate", "max_gradient_norm"),
             not_negative=("augmentations",),
-            fractions=("dark_fraction", "color_jitter", "warm_up", "average_decay"),
+            fractions=("dark_fraction", "color_jitter", "sensor_noise", "warm_up", "average_decay"),
             counts=("val_count",),
             between={
                 "max_images": (2, math.inf),
