@@ -18,7 +18,7 @@ freely licensed photographs. "cross-modal" is for images of different sensors, i
 bright may be swapped. For your own weights, the type is "learned-" or "cross-modal-" and the start
 of the SHA-256 of their file."""
 
-RATIO, LEARNED_RATIO, OTHER_LEARNED_RATIO = 0.85, 0.92, 0.88
+RATIO, LEARNED_RATIO, OTHER_LEARNED_RATIO = 0.85, 0.91, 0.88
 """Limits of Lowe's ratio test: for descriptors that are not learned, for "learned", and for the
 other learned ones. On photos/val, each matches unrelated photographs as often as RootSIFT at 0.85,
 and is more precise on views of one photograph."""

@@ -1,7 +1,7 @@
 // Learned descriptors, rotated and matched as in `deepdetect.features.learned`.
 import { mutualMatches } from "./matching.js";
 
-export const RATIO = 0.88;
+export const RATIO = 0.91;
 const CONSTANT = 16; // the first numbers do not change if the image is rotated
 // The rest are the real and then the imaginary parts of complex numbers, with these frequencies.
 const FREQUENCIES = [12, 8, 4].flatMap((count, k) => Array(count).fill(k + 1));
