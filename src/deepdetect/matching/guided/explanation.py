@@ -164,6 +164,7 @@ class Explanation:
         """Yield layers that the images confirm, the best first, then sparse ones."""
         pair, judge = self._seen(tentative.cross_modal)
         epipolar, refuted = None, np.zeros(len(tentative.points0), bool)
+        surely = False
         if self._asked != "homography":
             epipolar = propose_scene(pair, tentative, self._seed)
         flat: tuple[Layer, PlaneTracks] | None = None
@@ -185,12 +186,14 @@ class Explanation:
                 continue
             if view.repeated:
                 refuted |= plane.inliers
+                surely |= evidence.share >= HIGH_SHARE
                 continue
             exact = replace(plane, matrix=tracks.homography)
             least = 1 / 2 if evidence.share >= NEARLY_ALL else MOST
             if epipolar is not None and not _mostly(plane.inliers, epipolar.inliers, least):
                 part = exact
-                break
+                if evidence.share < MOST:
+                    break
             matches = match_along_plane(pair, self.pixels, exact.matrix, judge, evidence)
             if len(matches) >= self._enough:
                 flat = Layer(exact, matches, evidence), tracks
@@ -203,20 +206,20 @@ class Explanation:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
             if tracks is not None:
                 epipolar = epipolar.refitted(pair, tracks.points)
-            ways = (part, None) if flat is None else (flat[0].hypothesis,)
-            layer = None
-            if flat is None or _is_deep(*flat, self._seed) or _is_doubtful(flat[0], epipolar):
+            alone, layer = flat is None or part is not None, None
+            ways = (part, None) if flat is None or part else (flat[0].hypothesis,)
+            if alone or (flat and (_is_deep(*flat, self._seed) or _is_doubtful(flat[0], epipolar))):
                 layer = self._along_rows(pair, judge, epipolar, ways, free)
-            if layer is not None and (flat is None or _wins(layer, *flat, self._seed)):
+            if layer is not None and (alone or (flat and _wins(layer, *flat, self._seed))):
                 yield layer
             else:
                 sparse.append(epipolar)
         if flat is not None:
             yield flat[0]
         nothing = free is None and flat is None and epipolar is None
-        self.refuted = nothing and bool(refuted.any())
+        self.refuted = nothing and surely
         sparse = [each for each in sparse if self._nfa_of_moving(each) < MAX_SPARSE_LOG10_NFA]
-        if not self.refuted and sparse and free is None:
+        if sparse and free is None and not (nothing and refuted.any()):
             best = min(sparse, key=lambda each: each.log10_nfa)
             layer = self._sparse(best)
             if layer is not None:
