@@ -5,9 +5,9 @@
 DATA contains the folders oxford, hpatches, hdr, fountain, entry and the clips of KITTI. It may also
 contain roadscene, with crop_LR_visible and cropinfrared of the public photographs of that name.
 
-Images have 2,048 keypoints, matched as mutual nearest neighbours without a ratio test. SIFT (with
-RootSIFT, and a lower contrast threshold if there are few keypoints) and files of other methods have
-their own keypoints. The columns are:
+Images have 2,048 keypoints, matched as mutual nearest neighbours without a ratio test. SIFT
+(with RootSIFT, its best keypoints at any contrast) and files of other methods have their own
+keypoints. The columns are:
 
 - Correct matches: means over pairs of matches within 3 px of ground truth; 2 px for hdr, and 5 px
   for roadscene, whose photographs in visible and infrared light are aligned less exactly.
@@ -50,7 +50,6 @@ from deepdetect.io.image import load_image, luma
 from deepdetect_lab.datasets.planar import load_hpatches, load_oxford
 from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect_lab.evaluation.baselines.external import onnx_feature
-from deepdetect_lab.evaluation.baselines.opencv import STANDARD
 from deepdetect_lab.evaluation.metrics.homography import area_under_curve, corner_error
 from deepdetect_lab.evaluation.protocols.planar import pairs_of
 from deepdetect_lab.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
@@ -76,7 +75,11 @@ def methods(files: list[str]) -> dict[str, Extract]:
 
 
 def _extract_sift(rgb: np.ndarray) -> Keypoints:
-    return describe_keypoints(luma(rgb), STANDARD["sift"].detect(rgb).best(KEYPOINTS))
+    gray = luma(rgb)
+    # With OpenCV's own threshold, dark images have hardly any keypoints.
+    sift = cv2.SIFT_create(KEYPOINTS, contrastThreshold=1e-3, enable_precise_upscale=True)
+    found = Keypoints.from_opencv(sift.detect(gray, None), gray.shape[::-1])
+    return describe_keypoints(gray, found.best(KEYPOINTS))
 
 
 def _extract_other(file: str) -> Extract:
