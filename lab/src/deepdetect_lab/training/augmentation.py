@@ -35,6 +35,10 @@ BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
 """Ranges of the two factors of a `Darkening`. The product of the factors is below 0.25, so a
 darkened image spans fewer than 64 of the 256 grey levels: low visibility (`visibility_of`)."""
 
+EXPOSURE = (0.05, 0.24)
+"""Range of the brightness of a short exposure, which keeps its contrast. At 0.24, an image of all
+grey levels is just of low visibility."""
+
 TURN_PROBABILITY = 0.5
 """Share of the augmented views that are rotated by an arbitrary angle. All other views are rotated
 by multiples of 90 degrees, because the interpolation for other angles blurs a view."""
@@ -69,6 +73,12 @@ def draw_darkening(generator: np.random.Generator) -> Darkening:
         round(float(generator.uniform(*BRIGHTNESS)), 3),
         round(float(generator.uniform(*CONTRAST)), 3),
     )
+
+
+def draw_exposure(generator: np.random.Generator) -> Darkening:
+    """Draw the brightness of a short exposure, uniform in stops."""
+    low, high = EXPOSURE
+    return Darkening(round(float(low * (high / low) ** generator.uniform()), 3), 1.0)
 
 
 def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:

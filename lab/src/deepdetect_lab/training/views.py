@@ -18,7 +18,14 @@ from deepdetect.io.image import find_images, load_image, luma
 from ..datasets.scaling import scale_short_side
 from ..labels import LabelOptions, fuse
 from ..labels.settings import Visibility
-from .augmentation import AUGMENTATION_VERSION, Darkening, augment, darken, draw_darkening
+from .augmentation import (
+    AUGMENTATION_VERSION,
+    Darkening,
+    augment,
+    darken,
+    draw_darkening,
+    draw_exposure,
+)
 from .recipe import TrainingOptions
 
 
@@ -78,7 +85,8 @@ def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tup
     for _ in range(options.augmentations):
         seed = int(generator.integers(2**32))
         normal += (View(side, augmentation=seed),)
-        dark += (View(side, draw_darkening(generator), augmentation=seed),)
+        draw = draw_exposure if seed % 2 else draw_darkening
+        dark += (View(side, draw(generator), augmentation=seed),)
     return normal, dark
 
 

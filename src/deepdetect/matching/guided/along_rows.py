@@ -5,14 +5,14 @@ give. Each match ends at a sub-pixel position, not at a keypoint.
 
 A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
 are tracked from one view to the other, starting from the matches of the rows, and the matrix is
-fitted to the tracks. The images are rectified again if the new epipolar lines differ from the rows,
-or if the disparities have so narrow a range that larger images can be searched.
+fitted to the tracks. The images are rectified again if the new epipolar lines differ from the rows.
 
 The constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, unless noted.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,14 +40,16 @@ from ..stereo.matching import (
     compute_disparity,
     range_with_margin,
 )
-from ..stereo.sgm import DisparityRange
+from ..stereo.sgm import MAX_DIFFERENCE_PX, DisparityRange, refine_disparity
 from .image_pair import Pair
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """Options for matching rows. The range of disparities is set for each pair."""
 
-MAX_VOLUME = 2.5e7
-"""Images are scaled down if pixels times disparities exceed this, to bound time and memory."""
+MAX_PIXELS, MAX_VOLUME = 1e6, 1.2e7
+"""Frames are made with at most this many pixels. Their disparities are searched in copies that are
+scaled down if pixels times disparities exceed the second value, to bound time and memory; then they
+are refined in the frames themselves."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """The range of disparities is extended at both ends by this many pixels plus this fraction of its
@@ -68,10 +70,6 @@ MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
 """The images are rectified again if fewer than the second fraction of the tracked corners have
 their rows within the first distance of the refined epipolar lines. Chosen on Oxford and others."""
 
-MAX_RANGE_EXCESS = 1.25
-"""Scaled-down images are also rectified again if the searched range was more than this many times
-the range of the disparities found. Chosen on Oxford and others."""
-
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 """Maximum number of tracked corners, and side of their windows. Chosen on Oxford and others."""
 
@@ -90,26 +88,20 @@ MIN_AGREEMENT = 0.6
 quarter of the sparse matches end at the next window on the epipolar line."""
 
 
-FINER, MIN_NEAR = 2.0, 8
-"""If a wide range of disparities has made the images smaller than 1 / FINER of their size, what
-lies near the plane is matched again in images this many times as large: an eighth of the range is
-searched, so it takes as long. At least MIN_NEAR sparse matches must lie there."""
-
-
 @dataclass(frozen=True, eq=False)
 class RectifiedView:
     """Two rectified images and the disparities between them.
 
-    `views` are the images, scaled by `scale`, in the `frame`. `searched` is the range of
-    disparities that was tried. `disparity` is NaN where no match is kept. `relied` marks matches
-    that geometry may rely on. `correlation` is the local ZNCC of the first view with the second
-    view at its disparity. All arrays are (H, W).
+    `views` are the images, scaled by `scale`, in the `frame`. `step_px` is the step with which
+    disparities were searched. `disparity` is NaN where no match is
+    kept. `relied` marks matches that geometry may rely on. `correlation` is the local ZNCC of the
+    first view with the second view at its disparity. All arrays are (H, W).
     """
 
     frame: RectifiedFrame
     scale: float
+    step_px: float
     views: Pair
-    searched: DisparityRange
     disparity: np.ndarray
     relied: np.ndarray
     correlation: np.ndarray
@@ -147,15 +139,12 @@ def match_by_rectification(
     sizes = (grays[0].shape[::-1], grays[1].shape[::-1])
     view = rectified_view(grays, sparse, fundamental, plane)
     tracks = None if view is None else _track(view)
-    if view is not None and tracks is None:
-        view = _finer_view(grays, sparse, fundamental, plane, view)
-        tracks = None if view is None else _track(view)
     if view is None or tracks is None:
         return None
     tracked, on_rows = tracks
     fundamental = refine_fundamental((sparse, tracked), fundamental, sizes)
     row_error = np.quantile(epipolar_errors(tracked[0], on_rows, fundamental), ROW_QUANTILE)
-    if row_error > MAX_ROW_ERROR_PX or _is_range_too_wide(view):
+    if row_error > MAX_ROW_ERROR_PX:
         again = rectified_view(grays, tracked, fundamental, plane)
         tracks = None if again is None else _track(again)
         if again is not None and tracks is not None:
@@ -167,91 +156,105 @@ def match_by_rectification(
         return None
     # If the rows still do not fit the matrix, only matches that geometry relies on are kept.
     near = row_error * view.scale < MAX_ROW_ERROR_PX
-    samples = [_sample(view, xy0, relied_only=not near)]
-    fine = _finer_view(grays, sparse, fundamental, plane, view)
-    tracks = None if fine is None else _track(fine)
-    if fine is not None and tracks is not None:
-        fundamental = refine_fundamental((sparse, tracks[0]), fundamental, sizes)
-        samples.insert(0, _sample(fine, xy0))
-    rows, ends, scores = _first_of(samples)
+    rows, ends, scores = _sample(view, xy0, relied_only=not near)
     ends = _moved_to_lines(xy0[rows], ends, fundamental)
     inside = ((ends > -0.5) & (ends < np.array(sizes[1]) - 0.5)).all(axis=1)
     return fundamental, GuidedMatches(rows[inside], ends[inside], scores[inside], subpixel=True)
 
 
-def _finer_view(
-    grays: Pair,
-    sparse: Pair,
-    fundamental: np.ndarray,
-    plane: np.ndarray | None,
-    coarse: RectifiedView,
-) -> RectifiedView | None:
-    """Rectify larger images for what lies near a plane, if a wide range has made them small."""
-    if plane is None or coarse.scale > 1 / FINER:
-        return None
-    first, second = (coarse.to_frame(points, side) for side, points in enumerate(sparse))
-    limit = (coarse.searched[1] - coarse.searched[0]) / FINER**3 / 2
-    near = np.abs(first[:, 0] - second[:, 0]) < limit
-    if np.count_nonzero(near) < MIN_NEAR:
-        return None
-    return rectified_view(grays, (sparse[0][near], sparse[1][near]), fundamental, plane)
-
-
 def rectified_view(
-    grays: Pair,
-    sparse: Pair,
-    fundamental: np.ndarray,
-    plane: np.ndarray | None = None,
-    scale: float | None = None,
+    grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None = None
 ) -> RectifiedView | None:
-    """Rectify both images, scaled down if there is too much to search, and match their rows.
-
-    Only the function itself sets `scale`, when it calls itself with scaled-down images.
-    """
-    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
-    frame = rectified_frame(*sparse, fundamental, *sizes, plane)
+    """Rectify both images, and match their rows."""
+    ways = [None] if plane is None else [plane, None]
+    frames = [(_frame(grays, sparse, fundamental, way, 1.0), way) for way in ways]
+    volumes = [np.inf if each is None else _volume(each, sparse) for each, _ in frames]
+    frame, plane = frames[int(np.argmin(volumes))]
     if frame is None:
         return None
-    low, high = _range_of_matches(frame, sparse)
-    volume = float(np.prod(frame.size)) * (high - low + 1)
-    if scale is None and volume > MAX_VOLUME:
+    scale, pixels = 1.0, float(np.prod(frame.size))
+    if pixels > MAX_PIXELS:
         longest = max(max(gray.shape) for gray in grays)
-        scale = max(1, round(longest * (MAX_VOLUME / volume) ** (1 / 3))) / longest
-        small0, small1 = (downscale(gray, round(max(gray.shape) * scale))[0] for gray in grays)
-        points0, points1 = (scaled_points(points, scale) for points in sparse)
-        fundamental = scaled_fundamental(fundamental, scale, scale)
-        plane = None if plane is None else scaled_homography(plane, scale, scale)
-        return rectified_view((small0, small1), (points0, points1), fundamental, plane, scale)
-    (first, valid0), (second, valid1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
-    widest = frame.size[0] - 1
-    searched = max(low, -widest), min(high, widest)
+        scale = max(1, round(longest * (MAX_PIXELS / pixels) ** 0.5)) / longest
+        first, second = (downscale(gray, round(max(gray.shape) * scale))[0] for gray in grays)
+        grays = first, second
+        frame = _frame(grays, sparse, fundamental, plane, scale)
+        if frame is None:
+            return None
+    starts, ends = (scaled_points(points, scale) for points in sparse)
+    searched = _range_of_matches(frame, (starts, ends))
     if searched[0] >= searched[1]:
         return None
-    disparity, matched, correlation = _match_rows((first, second), (valid0, valid1), searched)
+    (first, shown0), (second, shown1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
+    disparity, matched, step_px = _match_rows((first, second), searched)
+    correlation = _correlation((first, second), (shown0, shown1), disparity, matched)
     kept, relied = (matched & (correlation >= bound) for bound in (0, MIN_CORRELATION))
     disparity = np.where(kept, disparity, np.float32(np.nan))
-    views = first, second
-    return RectifiedView(frame, scale or 1.0, views, searched, disparity, relied, correlation)
+    return RectifiedView(frame, scale, step_px, (first, second), disparity, relied, correlation)
 
 
-def _match_rows(
-    views: Pair, shown: Pair, searched: DisparityRange
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (H, W) disparities, where they are matched, and correlations (-1 if not matched)."""
-    rows = compute_disparity(*views, replace(DISPARITY, disparity_range=searched))
-    row, column = np.indices(rows.disparity.shape, dtype=np.float32)
-    x = np.where(rows.matched, column - rows.disparity, -1).astype(np.float32)
+def _volume(frame: RectifiedFrame, sparse: Pair) -> float:
+    """Return the number of pixels times that of disparities to search."""
+    low, high = _range_of_matches(frame, sparse)
+    return float(np.prod(frame.size)) * (high - low + 1)
+
+
+def _frame(
+    grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None, scale: float
+) -> RectifiedFrame | None:
+    """Return the frame of images that are scaled down, from geometry at their full size."""
+    points0, points1 = (scaled_points(points, scale) for points in sparse)
+    fundamental = scaled_fundamental(fundamental, scale, scale)
+    plane = None if plane is None else scaled_homography(plane, scale, scale)
+    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
+    return rectified_frame(points0, points1, fundamental, *sizes, plane)
+
+
+def _match_rows(views: Pair, searched: DisparityRange) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return (H, W) disparities, where they are matched, and the step with which they are searched.
+
+    They are searched in small copies, and refined in the views.
+    """
+    height, width = views[0].shape
+    volume = height * width * (searched[1] - searched[0] + 1)
+    factor = min(1.0, (MAX_VOLUME / volume) ** (1 / 3))
+    size = max(round(width * factor), 2), max(round(height * factor), 2)
+    factor = size[0] / width
+    left, right = (cv2.resize(view, size, interpolation=cv2.INTER_AREA) for view in views)
+    widest = size[0] - 1
+    low, high = math.floor(searched[0] * factor), math.ceil(searched[1] * factor)
+    low, high = max(low, -widest), min(high, widest)
+    rows = compute_disparity(left, right, replace(DISPARITY, disparity_range=(low, high)))
+    if size == (width, height):
+        return rows.disparity, rows.matched, 1.0
+    known = np.where(rows.matched, rows.disparity, np.float32(np.nan)) / factor
+    nearest, linear = (
+        cv2.resize(known, (width, height), interpolation=how)
+        for how in (cv2.INTER_NEAREST_EXACT, cv2.INTER_LINEAR)
+    )
+    with np.errstate(invalid="ignore"):
+        one_surface = np.abs(linear - nearest) < MAX_DIFFERENCE_PX / factor
+    start = np.where(one_surface, linear, nearest)
+    matched = np.isfinite(start)
+    return refine_disparity(*views, np.where(matched, start, 0), matched), matched, 1 / factor
+
+
+def _correlation(
+    views: Pair, shown: Pair, disparity: np.ndarray, matched: np.ndarray
+) -> np.ndarray:
+    """Return the (H, W) correlations of both views along disparities; -1 where nothing matches."""
+    row, column = np.indices(disparity.shape, dtype=np.float32)
+    x = np.where(matched, column - disparity, -1).astype(np.float32)
     aligned = cv2.remap(views[1], x, row, cv2.INTER_LINEAR)
     inside = cv2.remap(shown[1].astype(np.uint8), x, row, cv2.INTER_NEAREST) > 0
-    matched = rows.matched & shown[0] & inside
     correlation = local_zncc(
         gaussian_blur(views[0], CORRELATION_SIGMA_PX),
         gaussian_blur(aligned, CORRELATION_SIGMA_PX),
         np.ones(row.shape, bool),
         CORRELATION_WINDOW_PX,
     )
-    correlation = np.where(matched, np.nan_to_num(correlation), np.float32(-1))
-    return rows.disparity, matched, correlation
+    matched = matched & shown[0] & inside
+    return np.where(matched, np.nan_to_num(correlation), np.float32(-1))
 
 
 def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
@@ -267,13 +270,6 @@ def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
         if np.mean(disparity < 0) > MIN_FRACTION_OF_ONE_SIGN:
             largest = min(largest, MARGIN_PX)
     return int(np.floor(smallest)), int(np.ceil(largest))
-
-
-def _is_range_too_wide(view: RectifiedView) -> bool:
-    """Return whether images were scaled down for a range much wider than their matches need."""
-    low, high = range_with_margin(view.disparity[view.relied], MARGIN_PX, MARGIN_FRACTION)
-    searched = view.searched[1] - view.searched[0]
-    return view.scale < 1 and searched > MAX_RANGE_EXCESS * (high - low)
 
 
 def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
@@ -295,7 +291,7 @@ def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
         first, second, start, TRACKED_WINDOW_PX, levels=1, expected=expected
     )
     good = gaps < MAX_ROUND_TRIP_PX
-    good &= np.abs(ends - expected).max(axis=1) < MAX_TRACK_PX
+    good &= np.abs(ends - expected).max(axis=1) < MAX_TRACK_PX * view.step_px
     if np.count_nonzero(good) < MIN_TRACKS:
         return None
     start, ends = start[good], ends[good]
@@ -313,7 +309,7 @@ def _agreement(view: RectifiedView, sparse: Pair) -> float:
     inside, column, row = view.pixels_of(positions[0])
     errors = positions[0][inside, 0] - positions[1][inside, 0] - view.disparity[row, column]
     errors = np.abs(errors[view.relied[row, column] & np.isfinite(errors)])
-    return float((errors < MAX_DISAGREEMENT_PX).mean()) if len(errors) else 0.0
+    return float((errors < MAX_DISAGREEMENT_PX * view.step_px).mean()) if len(errors) else 0.0
 
 
 def _moved_to_lines(
@@ -325,15 +321,6 @@ def _moved_to_lines(
     distance = (normal * points1).sum(axis=1) + lines[:, 2]
     squared = np.maximum((normal**2).sum(axis=1), 1e-300)
     return np.asarray(points1 - normal * (distance / squared)[:, None])
-
-
-def _first_of(
-    samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Join samples of several views; of a keypoint in several, the first counts."""
-    rows, ends, scores = map(np.concatenate, zip(*samples, strict=True))
-    rows, one = np.unique(rows, return_index=True)
-    return rows, ends[one], scores[one]
 
 
 def _sample(

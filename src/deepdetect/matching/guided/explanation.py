@@ -207,9 +207,9 @@ class Explanation:
             if tracks is not None:
                 epipolar = epipolar.refitted(pair, tracks.points)
             alone, layer = flat is None or part is not None, None
-            ways = (part, None) if flat is None or part else (flat[0].hypothesis,)
+            known = part or (None if flat is None else flat[0].hypothesis)
             if alone or (flat and (_is_deep(*flat, self._seed) or _is_doubtful(flat[0], epipolar))):
-                layer = self._along_rows(pair, judge, epipolar, ways, free)
+                layer = self._along_rows(pair, judge, epipolar, known, free)
             if layer is not None and (alone or (flat and _wins(layer, *flat, self._seed))):
                 yield layer
             else:
@@ -248,20 +248,17 @@ class Explanation:
         pair: ImagePair,
         judge: Judge,
         epipolar: Hypothesis,
-        planes: Sequence[Hypothesis | None],
+        plane: Hypothesis | None,
         free: np.ndarray | None,
     ) -> Layer | None:
         """Match along epipolar lines, also in images that a plane makes alike; None if rejected."""
         count, lattice = len(self.pixels[0]), judge.lattice()
         everywhere = np.concatenate([self.pixels[0], lattice])
-        for plane in dict.fromkeys(planes):
-            known = None if plane is None else plane.matrix
-            found = match_by_rectification(
-                pair.grays, everywhere, epipolar.points, epipolar.matrix, plane=known
-            )
-            if found is not None and np.count_nonzero(found[1].indices0 < count) >= self._enough:
-                break
-        else:
+        known = None if plane is None else plane.matrix
+        found = match_by_rectification(
+            pair.grays, everywhere, epipolar.points, epipolar.matrix, plane=known
+        )
+        if found is None or np.count_nonzero(found[1].indices0 < count) < self._enough:
             return None
         matrix, both = found
         own = both.indices0 < count
