@@ -158,10 +158,10 @@ class GuidedMatches:
         return xy0[self.indices0] if self.points0 is None else self.points0
 
     def chosen(self, rows: np.ndarray) -> GuidedMatches:
-        """Return some of the matches along epipolar lines."""
-        return GuidedMatches(
-            self.indices0[rows], self.points1[rows], self.scores[rows], self.subpixel
-        )
+        """Return some of the matches of keypoints."""
+        indices1 = None if self.indices1 is None else self.indices1[rows]
+        columns = self.indices0[rows], self.points1[rows], self.scores[rows]
+        return GuidedMatches(*columns, self.subpixel, indices1)
 
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
         """Return these matches and those of `other` that the mask `chosen` selects."""

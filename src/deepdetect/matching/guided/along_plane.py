@@ -38,8 +38,9 @@ MIN_TRACKS, SQUARES = 15, 8
 """A homography is fitted to at least this number of tracks. The chessboard has this many squares
 along the longer side."""
 
-MAX_PARALLAX_PX = 60.0
-"""Tentative matches farther from the plane than this are not tracked: the views are too unlike."""
+MAX_PARALLAX = 0.06
+"""Tentative matches farther from the plane than this fraction of the longer side are not tracked:
+the views are too unlike."""
 
 NOISE_PX = 1.0
 """Tracks that miss the plane by less than this may be inexact. The error of tracks is a third."""
@@ -191,7 +192,7 @@ def _tracked(first: np.ndarray, second: np.ndarray, matrix: np.ndarray, matches:
     corners = cv2.goodFeaturesToTrack(equalised, CORNERS, 0.001, 5, mask=inside)
     starts = np.empty((0, 2)) if corners is None else corners.reshape(-1, 2)
     ends = transform_points(matches[1], np.linalg.inv(matrix))
-    near = np.linalg.norm(ends - matches[0], axis=1) < MAX_PARALLAX_PX
+    near = np.linalg.norm(ends - matches[0], axis=1) < MAX_PARALLAX * max(first.shape)
     starts, expected = (
         np.concatenate(both).astype(np.float32)
         for both in ((starts, matches[0][near]), (starts, ends[near]))

@@ -183,7 +183,7 @@ def rectified_view(
             return None
     starts, ends = (scaled_points(points, scale) for points in sparse)
     searched = _range_of_matches(frame, (starts, ends))
-    if searched[0] >= searched[1]:
+    if searched[0] >= searched[1]:  # both views show nothing in common
         return None
     (first, shown0), (second, shown1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
     disparity, matched, step_px = _match_rows((first, second), searched)
@@ -196,7 +196,7 @@ def rectified_view(
 def _volume(frame: RectifiedFrame, sparse: Pair) -> float:
     """Return the number of pixels times that of disparities to search."""
     low, high = _range_of_matches(frame, sparse)
-    return float(np.prod(frame.size)) * (high - low + 1)
+    return float(np.prod(frame.size)) * (high - low + 1) if high > low else np.inf
 
 
 def _frame(
@@ -269,7 +269,8 @@ def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
             smallest = max(smallest, -MARGIN_PX)
         if np.mean(disparity < 0) > MIN_FRACTION_OF_ONE_SIGN:
             largest = min(largest, MARGIN_PX)
-    return int(np.floor(smallest)), int(np.ceil(largest))
+    widest = frame.size[0] - 1
+    return max(math.floor(smallest), -widest), min(math.ceil(largest), widest)
 
 
 def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:

@@ -19,7 +19,7 @@ from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.transforms import outer_corners, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
-from .along_plane import MIN_ALIGNED, PlaneTracks, match_along_plane
+from .along_plane import MAX_PARALLAX, MIN_ALIGNED, PlaneTracks, match_along_plane
 from .along_rows import match_by_rectification
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
@@ -70,13 +70,17 @@ SCENE_MATCHES, DOMINANT_FRACTION = 1000, 0.5
 which makes it the largest part of the scene."""
 
 
+NO_MATCHES = GuidedMatches(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.float32))
+
+
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """What one geometry explains."""
+    """What one geometry explains; a plane also has the tracks that made it exact."""
 
     hypothesis: Hypothesis
     matches: GuidedMatches
     evidence: Evidence
+    tracks: PlaneTracks | None = None
 
     @property
     def dense(self) -> bool:
@@ -167,63 +171,76 @@ class Explanation:
         surely = False
         if self._asked != "homography":
             epipolar = propose_scene(pair, tentative, self._seed)
-        flat: tuple[Layer, PlaneTracks] | None = None
-        part: Hypothesis | None = None
-        tracks: PlaneTracks | None = None
         sparse: list[Hypothesis] = []
         flats: list[Hypothesis] = []
         if self._asked != "fundamental":
             flats = [*planes(pair, tentative, self._seed)]
-        for plane in flats:
-            self.best_nfa = min(self.best_nfa, plane.log10_nfa)
-            agreeing = plane.inliers if epipolar is None else plane.inliers | epipolar.inliers
-            some = tentative.chosen(agreeing)
-            tracks = PlaneTracks(pair, plane.matrix, (some.points0, some.points1))
-            view = judge.along_plane(tracks.homography)
-            evidence = self._on_free(view.evidence, free)
-            if not evidence.confirms:
-                sparse.append(plane)
-                continue
-            if view.repeated:
-                refuted |= plane.inliers
-                surely |= evidence.share >= HIGH_SHARE
-                continue
-            exact = replace(plane, matrix=tracks.homography)
-            least = 1 / 2 if evidence.share >= NEARLY_ALL else MOST
-            if epipolar is not None and not _mostly(plane.inliers, epipolar.inliers, least):
-                part = exact
-                if evidence.share < MOST:
-                    break
-            matches = match_along_plane(pair, self.pixels, exact.matrix, judge, evidence)
-            if len(matches) >= self._enough:
-                flat = Layer(exact, matches, evidence), tracks
-            break
+        seen = (self._seen_plane(pair, judge, plane, epipolar, free) for plane in flats)
+        flat: Layer | None = None
+        tracks: Pair | None = None
+        for layer, repeated in seen:
+            assert layer.tracks is not None
+            own, tracks = layer.hypothesis, layer.tracks.points
+            self.best_nfa = min(self.best_nfa, own.log10_nfa)
+            if not layer.evidence.confirms:
+                sparse.append(own)
+            elif repeated:
+                refuted |= own.inliers
+                surely |= layer.evidence.share >= HIGH_SHARE
+            else:
+                flat = layer
+                break
         if epipolar is not None and _mostly(refuted, epipolar.inliers, 1 / 2):
             epipolar = None  # it explains the same pattern
+        part = None
         if epipolar is not None:
+            if flat is not None:
+                least = 1 / 2 if flat.evidence.share >= NEARLY_ALL else MOST
+                part = None if _mostly(flat.hypothesis.inliers, epipolar.inliers, least) else flat
             epipolar = self._apart(pair, flats, epipolar)
-        if epipolar is not None:
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
             if tracks is not None:
-                epipolar = epipolar.refitted(pair, tracks.points)
-            alone, layer = flat is None or part is not None, None
-            known = part or (None if flat is None else flat[0].hypothesis)
-            if alone or (flat and (_is_deep(*flat, self._seed) or _is_doubtful(flat[0], epipolar))):
-                layer = self._along_rows(pair, judge, epipolar, known, free)
-            if layer is not None and (alone or (flat and _wins(layer, *flat, self._seed))):
-                yield layer
+                epipolar = epipolar.refitted(pair, tracks)
+        if flat is not None and len(flat.matches) < self._enough:
+            flat = None
+        if epipolar is not None:
+            deep, sure = None, None if part is not None else flat
+            if sure is None or _is_deep(sure, self._seed) or _is_doubtful(sure, epipolar):
+                deep = self._along_rows(pair, judge, epipolar, part or flat, free)
+            if deep is not None and (sure is None or _wins(deep, sure, self._seed)):
+                yield deep
             else:
                 sparse.append(epipolar)
-        if flat is not None:
-            yield flat[0]
+        if flat is not None and (part is None or part.evidence.share >= MOST):
+            yield flat
         nothing = free is None and flat is None and epipolar is None
         self.refuted = nothing and surely
         sparse = [each for each in sparse if self._nfa_of_moving(each) < MAX_SPARSE_LOG10_NFA]
         if sparse and free is None and not (nothing and refuted.any()):
             best = min(sparse, key=lambda each: each.log10_nfa)
-            layer = self._sparse(best)
-            if layer is not None:
-                yield layer
+            few = self._sparse(best)
+            if few is not None:
+                yield few
+
+    def _seen_plane(
+        self,
+        pair: ImagePair,
+        judge: Judge,
+        plane: Hypothesis,
+        epipolar: Hypothesis | None,
+        free: np.ndarray | None,
+    ) -> tuple[Layer, bool]:
+        """Return what a plane explains once it is exact, and whether the images repeat it."""
+        agreeing = plane.inliers if epipolar is None else plane.inliers | epipolar.inliers
+        some = plane.tentative.chosen(agreeing)
+        tracks = PlaneTracks(pair, plane.matrix, (some.points0, some.points1))
+        view = judge.along_plane(tracks.homography)
+        evidence = self._on_free(view.evidence, free)
+        exact, matches = replace(plane, matrix=tracks.homography), NO_MATCHES
+        repeated = evidence.confirms and view.repeated
+        if evidence.confirms and not repeated:
+            matches = match_along_plane(pair, self.pixels, exact.matrix, judge, evidence)
+        return Layer(exact, matches, evidence, tracks), repeated
 
     def _apart(
         self, pair: ImagePair, flats: Sequence[Hypothesis], epipolar: Hypothesis
@@ -248,17 +265,24 @@ class Explanation:
         pair: ImagePair,
         judge: Judge,
         epipolar: Hypothesis,
-        plane: Hypothesis | None,
+        plane: Layer | None,
         free: np.ndarray | None,
     ) -> Layer | None:
         """Match along epipolar lines, also in images that a plane makes alike; None if rejected."""
         count, lattice = len(self.pixels[0]), judge.lattice()
         everywhere = np.concatenate([self.pixels[0], lattice])
-        known = None if plane is None else plane.matrix
-        found = match_by_rectification(
-            pair.grays, everywhere, epipolar.points, epipolar.matrix, plane=known
-        )
-        if found is None or np.count_nonzero(found[1].indices0 < count) < self._enough:
+        ways, known = [epipolar.points], None
+        if plane is not None:  # what is far off it may be too unlike
+            known, reach_px = plane.hypothesis.matrix, MAX_PARALLAX * max(pair.sizes[0])
+            near = plane.hypothesis.errors(*epipolar.points) < reach_px
+            ways.append((epipolar.points[0][near], epipolar.points[1][near]))
+        for sparse in ways:
+            found = match_by_rectification(
+                pair.grays, everywhere, sparse, epipolar.matrix, plane=known
+            )
+            if found is not None and np.count_nonzero(found[1].indices0 < count) >= self._enough:
+                break
+        else:
             return None
         matrix, both = found
         own = both.indices0 < count
@@ -392,9 +416,10 @@ def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
         )
 
 
-def _is_deep(flat: Layer, tracks: PlaneTracks, seed: int) -> bool:
+def _is_deep(flat: Layer, seed: int) -> bool:
     """Return whether a scene has depth that a plane does not explain."""
-    parallax, matches = tracks.parallax(seed), flat.hypothesis.tentative
+    assert flat.tracks is not None
+    parallax, matches = flat.tracks.parallax(seed), flat.hypothesis.tentative
     if parallax.shows_depth:
         return True
     # Tracks are lost where the parallax is large, and matches are not.
@@ -411,11 +436,11 @@ def _is_doubtful(flat: Layer, epipolar: Hypothesis) -> bool:
     return few and flat.evidence.share < MOST
 
 
-def _wins(deep: Layer, flat: Layer, tracks: PlaneTracks, seed: int) -> bool:
+def _wins(deep: Layer, flat: Layer, seed: int) -> bool:
     """Return whether a scene has depth: by parallax, or because the plane explains less of it."""
     if deep.evidence.windows < flat.evidence.windows / 2:
         return False
-    return _is_deep(flat, tracks, seed) or deep.evidence.share > flat.evidence.share
+    return _is_deep(flat, seed) or deep.evidence.share > flat.evidence.share
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
