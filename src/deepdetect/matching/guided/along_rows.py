@@ -34,6 +34,7 @@ from ...geometry.transforms import (
     scaled_fundamental,
     scaled_homography,
     scaled_points,
+    transfer_errors,
 )
 from ..stereo.matching import (
     DisparityOptions,
@@ -41,6 +42,7 @@ from ..stereo.matching import (
     range_with_margin,
 )
 from ..stereo.sgm import MAX_DIFFERENCE_PX, DisparityRange, refine_disparity
+from .along_plane import MAX_PARALLAX
 from .image_pair import Pair
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
@@ -50,6 +52,10 @@ MAX_PIXELS, MAX_VOLUME = 1e6, 1.2e7
 """Frames are made with at most this many pixels. Their disparities are searched in copies that are
 scaled down if pixels times disparities exceed the second value, to bound time and memory; then they
 are refined in the frames themselves."""
+
+MAX_STEP_PX = 4.0
+"""If disparities are searched in steps of more than this, what is near a plane may be matched in
+finer ones, which can be more."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """The range of disparities is extended at both ends by this many pixels plus this fraction of its
@@ -137,11 +143,10 @@ def match_by_rectification(
     tracked, the sparse matches contradict the disparities, or the pair cannot be rectified.
     """
     sizes = (grays[0].shape[::-1], grays[1].shape[::-1])
-    view = rectified_view(grays, sparse, fundamental, plane)
-    tracks = None if view is None else _track(view)
-    if view is None or tracks is None:
+    found = _best_view(grays, sparse, fundamental, plane)
+    if found is None:
         return None
-    tracked, on_rows = tracks
+    view, (tracked, on_rows) = found
     fundamental = refine_fundamental((sparse, tracked), fundamental, sizes)
     row_error = np.quantile(epipolar_errors(tracked[0], on_rows, fundamental), ROW_QUANTILE)
     if row_error > MAX_ROW_ERROR_PX:
@@ -160,6 +165,28 @@ def match_by_rectification(
     ends = _moved_to_lines(xy0[rows], ends, fundamental)
     inside = ((ends > -0.5) & (ends < np.array(sizes[1]) - 0.5)).all(axis=1)
     return fundamental, GuidedMatches(rows[inside], ends[inside], scores[inside], subpixel=True)
+
+
+def _best_view(
+    grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None
+) -> tuple[RectifiedView, tuple[Pair, np.ndarray]] | None:
+    """Return the view that matches most, and its tracks: of all disparities, or near a plane."""
+    ways, best, most = [sparse], None, 0.0
+    if plane is not None:
+        reach_px = MAX_PARALLAX * max(grays[0].shape)
+        near = transfer_errors(*sparse, plane) < reach_px
+        ways.append((sparse[0][near], sparse[1][near]))
+    for points in ways:
+        view = rectified_view(grays, points, fundamental, plane)
+        tracks = None if view is None else _track(view)
+        if view is None or tracks is None:
+            continue
+        matched = np.count_nonzero(view.relied) / view.scale**2
+        if matched > most:
+            best, most = (view, tracks), matched
+        if view.step_px <= MAX_STEP_PX:
+            break
+    return best
 
 
 def rectified_view(

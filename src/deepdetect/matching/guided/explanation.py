@@ -19,7 +19,7 @@ from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.transforms import outer_corners, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
-from .along_plane import MAX_PARALLAX, MIN_ALIGNED, PlaneTracks, match_along_plane
+from .along_plane import MIN_ALIGNED, PlaneTracks, match_along_plane
 from .along_rows import match_by_rectification
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
@@ -271,18 +271,11 @@ class Explanation:
         """Match along epipolar lines, also in images that a plane makes alike; None if rejected."""
         count, lattice = len(self.pixels[0]), judge.lattice()
         everywhere = np.concatenate([self.pixels[0], lattice])
-        ways, known = [epipolar.points], None
-        if plane is not None:  # what is far off it may be too unlike
-            known, reach_px = plane.hypothesis.matrix, MAX_PARALLAX * max(pair.sizes[0])
-            near = plane.hypothesis.errors(*epipolar.points) < reach_px
-            ways.append((epipolar.points[0][near], epipolar.points[1][near]))
-        for sparse in ways:
-            found = match_by_rectification(
-                pair.grays, everywhere, sparse, epipolar.matrix, plane=known
-            )
-            if found is not None and np.count_nonzero(found[1].indices0 < count) >= self._enough:
-                break
-        else:
+        known = None if plane is None else plane.hypothesis.matrix
+        found = match_by_rectification(
+            pair.grays, everywhere, epipolar.points, epipolar.matrix, plane=known
+        )
+        if found is None or np.count_nonzero(found[1].indices0 < count) < self._enough:
             return None
         matrix, both = found
         own = both.indices0 < count
