@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CARDS = {name: FOLDER / f"{name.upper()}_CARD.md" for name in PRETRAINED} | {
     "default": FOLDER / "MODEL_CARD.md"
 }
-DESCRIPTORS = ("descriptor", "descriptor_free", "descriptor_cross_modal")
+DESCRIPTORS = ("descriptor", "descriptor_free")
 FRONT_MATTER = """---
 license: mit
 library_name: deepdetect

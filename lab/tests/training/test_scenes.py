@@ -11,7 +11,6 @@ from deepdetect_lab.training.scenes import (
     View,
     correspond,
     draw_layers,
-    mix_colours,
     render_layers,
 )
 
@@ -83,10 +82,3 @@ def test_layers_in_front_hide_what_is_behind(textures: Path) -> None:
     xy = np.argwhere(clear)[::50, ::-1].astype(np.float32)
     _, _, seen = correspond(plain, [top, np.full_like(top, 9)], xy)  # the second hides all
     assert not seen.any()
-
-
-def test_a_mixture_of_colours_is_lifted_above_zero() -> None:
-    colours = np.array([[[255, 0, 0], [0, 255, 0], [10, 20, 30]]], np.uint8)
-    red = np.array([[1, 0, 0]], np.float32)
-    np.testing.assert_array_equal(mix_colours(colours, red), [[255, 0, 10]])
-    np.testing.assert_array_equal(mix_colours(colours, -red), [[0, 255, 245]])

@@ -15,8 +15,8 @@ LEARNED_FREE: Final = "learned-free"
 CROSS_MODAL: Final = "cross-modal"
 """Values of `Keypoints.descriptor_type` for learned descriptors. "learned-free" was trained only on
 freely licensed photographs. "cross-modal" is for images of different sensors, in which dark and
-bright may be swapped. For your own weights, the type is "learned-" or "cross-modal-" and the start
-of the SHA-256 of their file."""
+bright may be swapped: "learned" descriptors of the strength of their edges. For your own weights,
+the type is "learned-" and the start of the SHA-256 of their file."""
 
 RATIO, LEARNED_RATIO, OTHER_LEARNED_RATIO = 0.85, 0.91, 0.88
 """Limits of Lowe's ratio test: for descriptors that are not learned, for "learned", and for the
@@ -54,15 +54,6 @@ def ratio_limit(descriptor_type: str | None) -> float:
     return OTHER_LEARNED_RATIO if is_learned(descriptor_type) else RATIO
 
 
-def angles_counted(descriptor_type: str) -> int:
-    """Return the factor by which keypoint angles are multiplied before descriptors are rotated.
-
-    It is 2 for cross-modal descriptors, and 1 for others. In the image of another sensor, a
-    gradient may point the opposite way. Doubling makes the angles of opposite directions equal.
-    """
-    return 2 if descriptor_type.startswith(CROSS_MODAL) else 1
-
-
 def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np.ndarray:
     """Rotate (N, 64) float32 learned descriptors, as if the image were rotated.
 
@@ -90,11 +81,9 @@ def match_learned(
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
     assert descriptors0 is not None
     assert descriptors1 is not None
-    assert features0.descriptor_type is not None
     if features0.angles is None or features1.angles is None:
         return match(descriptors0, descriptors1)
-    counted = angles_counted(features0.descriptor_type)
-    angles0, angles1 = counted * features0.angles, counted * features1.angles
+    angles0, angles1 = features0.angles, features1.angles
     own = match(descriptors0[:TURNED_KEYPOINTS], descriptors1[:TURNED_KEYPOINTS])
     turn = common_turn(angles1[own.indices1] - angles0[own.indices0])
     first = turn_descriptors(descriptors0, angles0)

@@ -276,7 +276,6 @@ class DescriptorTrainingOptions:
         learning_rate: highest learning rate (of Muon), after the warm-up; it falls linearly to 0.
         val_count: number of validations.
         val_pairs: number of validation pairs of each kind: upright, rotated, zoomed.
-        cross_modal: imitate two different sensors by mixed colour channels, changed tones or edges.
         crops: crops of photographs in each step whose points teachers have read; 0: no teachers.
         seed: seed of the weights and the pairs.
 
@@ -289,7 +288,6 @@ class DescriptorTrainingOptions:
     learning_rate: float = 0.012
     val_count: int = 12
     val_pairs: int = 48
-    cross_modal: bool = False
     crops: int = 0
     seed: int = 0
 

@@ -286,18 +286,15 @@ def _draw_front(
     return Layer(photograph, (View(own, None, side_px), View(own @ motion, None, side_px)), shape)
 
 
-def render_layers(
-    layers: Sequence[Layer], side: int, scale: float, mixture: np.ndarray | None = None
-) -> tuple[np.ndarray, ...]:
+def render_layers(layers: Sequence[Layer], side: int, scale: float) -> tuple[np.ndarray, ...]:
     """Render one of the two views; return (S, S) float32 and the number of each pixel's top layer.
 
-    `side` is 0 for the first view, 1 for the second. The view shows the luma, or the colour
-    channels mixed with the weights `mixture` (1, 3).
+    `side` is 0 for the first view, 1 for the second. The view shows the luma.
     """
     size = (layers[0].views[side].side_px,) * 2
     view, top = np.zeros(size, np.float32), np.zeros(size, np.uint8)
     for number, (photograph, views, shape) in enumerate(layers):
-        smooth = luma(photograph) if mixture is None else mix_colours(photograph, mixture)
+        smooth = luma(photograph)
         if scale > ALIASED_SCALE:
             sigma = PIXEL_SIGMA * math.sqrt(scale * scale - 1)
             smooth = cv2.GaussianBlur(smooth, (0, 0), sigma)
@@ -310,16 +307,6 @@ def render_layers(
         view = view * (1 - cover) + shown * cover
         top[cover > COVERED] = number
     return view, top
-
-
-def mix_colours(photograph: np.ndarray, mixture: np.ndarray) -> np.ndarray:
-    """Mix the colour channels of (H, W, 3) uint8 with weights (1, 3); return (H, W) uint8.
-
-    If weights are negative, an offset is added, so that values do not fall below 0.
-    """
-    mixed = cv2.transform(photograph.astype(np.float32), mixture)
-    lifted: np.ndarray = np.clip(mixed - 255 * np.minimum(mixture, 0).sum(), 0, 255)
-    return lifted.astype(np.uint8)
 
 
 def correspond(

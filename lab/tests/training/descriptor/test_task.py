@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -163,18 +162,4 @@ def test_images_without_detail_are_refused(tmp_path: Path, monkeypatch: pytest.M
     cv2.imwrite(str(tmp_path / "grey.png"), np.full((480, 480), 90, np.uint8))
     monkeypatch.setattr("deepdetect_lab.training.scenes.ATTEMPTS", 1)
     with pytest.raises(OptionError, match="detail"):
-        draw_numbered([tmp_path / "grey.png"], False, 2)
-
-
-def test_cross_modal_weights_are_told_from_others(textures: Path, tmp_path: Path) -> None:
-    options = replace(OPTIONS, steps=1, cross_modal=True)
-    found = train_on_pairs(textures, textures, tmp_path, options, device="cpu")
-    assert found.onnx is not None
-    points = PointDetector(200, descriptor=found.onnx)
-    assert points.descriptor_type == f"cross-modal-{file_digest(found.onnx)[:16]}"
-    first = points.extract(textures / "0.png")
-    assert first.descriptors is not None
-    assert first.angles is not None
-    # Half a turn of a keypoint is none.
-    again = points.describe(textures / "0.png", replace(first, angles=(first.angles + 180) % 360))
-    np.testing.assert_allclose(again.descriptors, first.descriptors, atol=1e-5)
+        draw_numbered([tmp_path / "grey.png"], 2)

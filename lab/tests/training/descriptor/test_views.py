@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deepdetect_lab.training.descriptor.views import change_tones, draw_pair, photograph_view
+from deepdetect_lab.training.descriptor.views import draw_pair, photograph_view
 from deepdetect_lab.training.scenes import SIDE_PX
 
 
@@ -32,24 +32,3 @@ def test_light_changes_values_but_not_places() -> None:
     for seed in range(30):
         changed = photograph_view(np.random.default_rng(seed), image).astype(float)
         assert changed[110:146, 78:114].mean() > changed[110:146, 160:196].mean()
-
-
-def test_other_tones_stay_at_their_places() -> None:
-    image = np.zeros((SIDE_PX, SIDE_PX), np.float32)
-    image[96:160, 64:128] = 0.8
-    darker = 0
-    for seed in range(30):
-        changed = change_tones(np.random.default_rng(seed), image)
-        assert 0 <= changed.min() < changed.max() <= 1
-        inside, beside = changed[110:146, 78:114].mean(), changed[110:146, 160:196].mean()
-        darker += inside < beside
-        at_edge = np.abs(np.diff(changed[128])).argmax()
-        assert min(abs(at_edge - 63), abs(at_edge - 127)) < 5
-    assert 8 < darker < 22
-
-
-def test_views_as_of_different_sensors_show_the_same_keypoints(textures: Path) -> None:
-    drawn = [draw_pair(np.random.default_rng(k), files(textures), True) for k in range(12)]
-    pairs = [pair for pair in drawn if pair is not None]
-    assert len(pairs) > 6
-    assert all(pair.valid.sum() >= 40 for pair in pairs)

@@ -20,17 +20,17 @@ from ...features.learned import (
     LEARNED,
     LEARNED_FREE,
     LENGTH,
-    angles_counted,
     turn_descriptors,
 )
 from ...features.scale_space import set_angles
 from ...features.sift import ROOT_SIFT
+from ...geometry.images import edge_strength
 from ..pretrained import RANKER, resolve_weights
 
 DESCRIPTOR_GRAPHS = {
     LEARNED: RANKER.with_name("descriptor.onnx"),
     LEARNED_FREE: RANKER.with_name("descriptor_free.onnx"),
-    CROSS_MODAL: RANKER.with_name("descriptor_cross_modal.onnx"),
+    CROSS_MODAL: RANKER.with_name("descriptor.onnx"),
 }
 """ONNX files by descriptor type. Their inputs are `luma` (1, 1, H, W) in [0, 1], `xy` (1, N, 2) in
 pixels and `sizes` (1, N), diameters in pixels. Their output is `descriptors` (1, N, 64), unit
@@ -49,8 +49,10 @@ def describe_learned(
     """Return keypoints with learned descriptors at their own sizes and angles.
 
     `gray` is the (H, W) uint8 luma of the image, possibly scaled down. Angles that are missing or
-    -1 are replaced by the dominant gradient orientations. `descriptor` is a name in
-    `DESCRIPTOR_GRAPHS`, or a similar ONNX file. Keypoints without sizes raise an OptionError.
+    -1 are replaced by the dominant gradient orientations; those of "cross-modal" descriptors are
+    always the orientations of `edge_strength`, which they describe in place of the luma.
+    `descriptor` is a name in `DESCRIPTOR_GRAPHS`, or a similar ONNX file. Keypoints without sizes
+    raise an OptionError.
     """
     kind = descriptor_type(descriptor)
     if not len(keypoints):
@@ -60,10 +62,13 @@ def describe_learned(
         raise OptionError(
             "learned descriptors need sizes above 0: use a PointDetector's keypoints, or RootSIFT"
         )
+    given = keypoints.angles
+    if kind == CROSS_MODAL:
+        gray, given = edge_strength(gray), None
     height, width = gray.shape
     factor = np.divide((width, height), keypoints.image_size).astype(np.float32)
     xy, sizes = (keypoints.xy + 0.5) * factor - 0.5, keypoints.sizes * factor.mean()
-    angles = set_angles(gray, xy, sizes, keypoints.angles)
+    angles = set_angles(gray, xy, sizes, given)
     below, right = -height % STRIDE, -width % STRIDE
     padded = cv2.copyMakeBorder(gray, 0, below, 0, right, cv2.BORDER_REFLECT_101)
     luma = padded[None, None].astype(np.float32) / 255
@@ -71,21 +76,21 @@ def describe_learned(
     path = DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor))
     session = _session(path, kind[-DIGEST_LENGTH:], thread_limit())
     upright = session.run(["descriptors"], inputs)[0][0]
-    descriptors = turn_descriptors(upright, -angles_counted(kind) * angles)
+    descriptors = turn_descriptors(upright, -angles)
     return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type=kind)
 
 
 def descriptor_type(descriptor: str | Path) -> str:
     """Return the `Keypoints.descriptor_type` of a bundled descriptor, by name, or of an ONNX file.
 
-    The type of a file is "learned-" or "cross-modal-" and the start of its SHA-256.
+    The type of a file is "learned-" and the start of its SHA-256.
     """
     if str(descriptor) in (*DESCRIPTOR_GRAPHS, ROOT_SIFT):
         return str(descriptor)
     path = resolve_weights(descriptor)
     digest = file_digest(path)[:DIGEST_LENGTH]
-    cross_modal = _session(path, digest, thread_limit()).get_modelmeta().description == CROSS_MODAL
-    return f"{CROSS_MODAL if cross_modal else LEARNED}-{digest}"
+    _session(path, digest, thread_limit())  # raises an error if it is not a descriptor's
+    return f"{LEARNED}-{digest}"
 
 
 @functools.cache

@@ -15,7 +15,6 @@ from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from deepdetect._shared.atomic import atomic_path
 from deepdetect.detector.points.descriptor import STRIDE
-from deepdetect.features.learned import LEARNED
 
 from ...networks.export import to_onnx
 from .network import KeypointNetwork
@@ -25,10 +24,10 @@ MIN_HALVED = 1000
 converts them to float32 before it computes with them."""
 
 
-def export_descriptor(network: KeypointNetwork, path: Path, kind: str = LEARNED) -> None:
+def export_descriptor(network: KeypointNetwork, path: Path) -> None:
     """Write a network as an ONNX file for `PointDetector(descriptor=...)`.
 
-    `DESCRIPTOR_GRAPHS` lists the inputs and outputs. `kind` is the type of the descriptors.
+    `DESCRIPTOR_GRAPHS` lists the inputs and outputs.
     """
     network = copy.deepcopy(network).eval()
     for linear, norm in (("input", "norm"), ("middle", "middle_norm")):
@@ -40,7 +39,7 @@ def export_descriptor(network: KeypointNetwork, path: Path, kind: str = LEARNED)
     axes = {name: {1: "keypoints"} for name in ("xy", "sizes", "descriptors")}
     axes["luma"] = {2: "height", 3: "width"}
     model = to_onnx(network, inputs, "descriptors", axes)
-    model.doc_string, graph = kind, model.graph
+    graph = model.graph
     for kernel in [each for each in graph.initializer if math.prod(each.dims) > MIN_HALVED]:
         values = onnx.numpy_helper.to_array(kernel).astype(np.float16)
         halved = onnx.numpy_helper.from_array(values, f"{kernel.name}_float16")

@@ -65,14 +65,14 @@ def mirror(batch: Pair, which: Tensor) -> Pair:
 
 
 def contrastive_loss(
-    network: KeypointNetwork, batch: Pair, generator: np.random.Generator, counted: int = 1
+    network: KeypointNetwork, batch: Pair, generator: np.random.Generator
 ) -> Tensor:
     """Return the symmetric InfoNCE loss, the cross-entropy of the true match among all keypoints.
 
-    Half of the pairs are mirrored. The descriptors of the second view are rotated back by `counted`
-    (see `angles_counted`) times the rotation between the views at each keypoint, with random errors
-    like those of a detector. Half of the pairs that are rotated by less than `UPRIGHT` are not
-    rotated back, because in use upright images are described without rotation.
+    Half of the pairs are mirrored. The descriptors of the second view are rotated back by the
+    rotation between the views at each keypoint, with random errors like those of a detector. Half
+    of the pairs that are rotated by less than `UPRIGHT` are not rotated back, because in use
+    upright images are described without rotation.
     """
     mirrored = torch.from_numpy(generator.random(len(batch.turn)) < 0.5)
     batch = mirror(batch, mirrored.to(batch.turn.device))
@@ -80,7 +80,7 @@ def contrastive_loss(
     kept = torch.from_numpy(generator.random(len(batch.turn)) < 0.5).to(device)
     noise = torch.from_numpy(generator.normal(0, ANGLE_NOISE, batch.turns.shape)).to(device)
     as_is = kept & (batch.turn < UPRIGHT)
-    second = turn(second, torch.where(as_is[:, None], 0, -counted * (batch.turns + noise.float())))
+    second = turn(second, torch.where(as_is[:, None], 0, -(batch.turns + noise.float())))
     similar = (
         first @ second.transpose(1, 2) * network.temperature.clamp(max=MAX_LOG_TEMPERATURE).exp()
     )
@@ -98,9 +98,7 @@ def _near(xy: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def shares_right(
-    network: KeypointNetwork, batches: Iterable[Pair], counted: int = 1
-) -> dict[str, float]:
+def shares_right(network: KeypointNetwork, batches: Iterable[Pair]) -> dict[str, float]:
     """Return the share of keypoints whose mutual nearest neighbour is correct, by kind of pair.
 
     The network must be in evaluation mode, and `batches` must hold pairs of each of `KINDS`.
@@ -110,7 +108,7 @@ def shares_right(
     for batch in batches:
         first, second = describe_views(network, batch)
         noise = generator.normal(0, ANGLE_NOISE, batch.turns.shape).astype(np.float32)
-        angles = counted * (batch.turns + torch.from_numpy(noise).to(second.device))
+        angles = batch.turns + torch.from_numpy(noise).to(second.device)
         turned = turn(second, -angles)
         for row, valid in enumerate(batch.valid):
             angle, zoom = batch.turn[row].item(), batch.zoom[row].item()

@@ -12,8 +12,6 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
-from deepdetect.features.learned import CROSS_MODAL, LEARNED, angles_counted
-
 from ...networks.weights import load_network, weights_digest
 from ..optim import Muon
 from ..recipe import DescriptorTrainingOptions, DeviceOptions
@@ -60,10 +58,10 @@ def pairs_to_draw(
         drawn |= wanted
 
 
-def draw_numbered(files: Sequence[Path], cross_modal: bool, *seed: int) -> Pair:
+def draw_numbered(files: Sequence[Path], *seed: int) -> Pair:
     """Draw the pair of a seed; raise an OptionError if the images have too little detail."""
     generator = np.random.default_rng(seed)
-    return draw_until_seen(lambda: draw_pair(generator, files, cross_modal))
+    return draw_until_seen(lambda: draw_pair(generator, files))
 
 
 def stack(pairs: Sequence[Pair]) -> Pair:
@@ -79,8 +77,7 @@ class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
 
     def __getitem__(self, index: tuple[int, list[int]]) -> tuple[int, list[int], Pair | None]:
         step, numbers = index
-        fixed = self.files, self.options.cross_modal, self.options.seed, 3
-        pairs = [draw_numbered(*fixed, number) for number in numbers]
+        pairs = [draw_numbered(self.files, self.options.seed, 3, number) for number in numbers]
         return step, numbers, stack(pairs) if pairs else None
 
 
@@ -89,7 +86,7 @@ def validation_batches(files: Sequence[Path], options: DescriptorTrainingOptions
     pairs: dict[str, list[Pair]] = {kind: [] for kind in KINDS}
     number = 0
     while min(map(len, pairs.values())) < options.val_pairs:
-        pair = draw_numbered(files, options.cross_modal, 0, 2, number)
+        pair = draw_numbered(files, 0, 2, number)
         number += 1
         if len(of_kind := pairs[kind_of(pair.turn, pair.zoom)]) < options.val_pairs:
             of_kind.append(pair)
@@ -126,7 +123,6 @@ class DescriptorTrainer(Trainer):
         device: DeviceOptions,
     ) -> None:
         self.options, self.num_workers = options, device.worker_count
-        self.kind = CROSS_MODAL if options.cross_modal else LEARNED
         self.device = torch.device(device.accelerator)
         self.files = images
         network: Any = self.first_network(init_weights)
@@ -201,7 +197,7 @@ class DescriptorTrainer(Trainer):
 
     def loss_of_pairs(self, pairs: Pair, generator: np.random.Generator) -> Tensor:
         """Return the loss of the pairs of a step."""
-        return contrastive_loss(self.network, pairs, generator, angles_counted(self.kind))
+        return contrastive_loss(self.network, pairs, generator)
 
     def learning_rate(self, step: int) -> float:
         """Return Muon's learning rate in a step: a warm-up, a plateau, a linear decay to 0."""
@@ -212,10 +208,10 @@ class DescriptorTrainer(Trainer):
 
     def validate(self, step: int) -> dict[str, float]:
         """Measure the averaged weights on the validation pairs."""
-        shares = shares_right(self.average, self.batches, angles_counted(self.kind))
+        shares = shares_right(self.average, self.batches)
         return {"score": sum(shares.values()) / len(shares), **shares}
 
     def export(self, folder: Path) -> Path | None:
         best: Any = load_network(folder / self.weights_file, self.kind_of_network)
-        export_descriptor(best, folder / ONNX, self.kind)
+        export_descriptor(best, folder / ONNX)
         return folder / ONNX

@@ -12,13 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from deepdetect._shared.opencv import cv2
 from deepdetect.detector.points.detection import SIZE_PER_SIGMA
 from deepdetect.detector.points.hessian_scales import build_scale_space, find_candidates
 
 from ..scenes import MARGIN_PX, correspond, draw_layers, render_layers
 from ..synthetic import (
-    NOISE_CELLS,
     WHITE,
     Camera,
     Effect,
@@ -27,7 +25,6 @@ from ..synthetic import (
     happens,
     record,
     relight,
-    smooth_noise,
 )
 
 KEYPOINTS = 256
@@ -87,28 +84,6 @@ CAMERA = Camera(
 """Random changes of each view. They go down to 1/50 of the light and to JPEG quality 8, the lowest
 values that occur in use. How much each of the ranges contributes was not measured."""
 
-CROSS_MODAL_SHARE, MIXED_SHARE = 0.6, 0.45
-"""`CROSS_MODAL_SHARE` of the cross-modal pairs have changed tones in one view (`change_tones`).
-`MIXED_SHARE` have mixed colour channels in one view (`draw_mixture`). A pair may have both."""
-
-ONE_COLOUR_SHARE, MIXTURE_DEVIATION, LEAST_WEIGHT = 0.4, 0.6, 0.5
-"""A mixture is a single colour channel with the probability `ONE_COLOUR_SHARE`. Otherwise its three
-weights are normally distributed with mean 1/3 and standard deviation `MIXTURE_DEVIATION`, and
-divided by the sum of their absolute values, or by `LEAST_WEIGHT` if the sum is smaller."""
-
-TONES = {"negative": 0.35, "curve": 0.7, "curves": 0.88}
-"""Cumulative shares of three ways to change the tones of a view: a negative, one tone curve, or a
-blend of two tone curves. The remaining views show edges."""
-
-CURVE_TONES = (3, 8)
-"""A tone curve is drawn through 3 to 7 random values. More would turn the image into noise."""
-
-EDGE_SIGMA_PX, EDGE_QUANTILE = (0.7, 1.5), 0.98
-"""A view of edges shows gradient magnitudes after a Gaussian blur, whose sigma in pixels is drawn
-from `EDGE_SIGMA_PX`. Magnitudes from the quantile `EDGE_QUANTILE` on become white."""
-
-DARK_EDGES_SHARE = 0.5
-
 
 class Pair(NamedTuple):
     """Two views and their corresponding keypoints; 0 and 1 in names stand for the views.
@@ -136,24 +111,12 @@ class Pair(NamedTuple):
     zoom: Any
 
 
-def draw_pair(
-    rng: np.random.Generator, files: Sequence[Path], cross_modal: bool = False
-) -> Pair | None:
-    """Draw a pair of views, or return None if they share too few keypoints.
-
-    With `cross_modal`, the views imitate images of two different sensors.
-    """
+def draw_pair(rng: np.random.Generator, files: Sequence[Path]) -> Pair | None:
+    """Draw a pair of views, or return None if they share too few keypoints."""
     layers, scales, turn = draw_layers(rng, files)
-    mixtures: list[np.ndarray | None] = [None, None]
-    if cross_modal and happens(rng, MIXED_SHARE):
-        mixtures[int(rng.integers(2))] = draw_mixture(rng)
-    rendered = (render_layers(layers, k, scales[k], mixtures[k]) for k in range(2))
+    rendered = (render_layers(layers, k, scales[k]) for k in range(2))
     views, tops = zip(*rendered, strict=True)
-    seen = [view / WHITE for view in views]
-    if cross_modal and happens(rng, CROSS_MODAL_SHARE):
-        other = int(rng.integers(2))
-        seen[other] = change_tones(rng, seen[other])
-    images = [photograph_view(rng, view) for view in seen]
+    images = [photograph_view(rng, view / WHITE) for view in views]
     clean = happens(rng, CLEAN_SHARE)
     xy0, sigmas0 = find_keypoints(views[0].astype(np.uint8) if clean else images[0])
     xy0 = (xy0 + rng.uniform(-JITTER_PX, JITTER_PX, xy0.shape)).astype(np.float32)
@@ -195,37 +158,3 @@ def find_keypoints(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rows = np.flatnonzero(inside.all(1) & (found.sigma_px < MAX_FIRST_SIGMA_PX))
     rows = rows[np.argsort(found.rank[rows])][:STRONGEST]
     return found.xy[rows], found.sigma_px[rows]
-
-
-def draw_mixture(rng: np.random.Generator) -> np.ndarray:
-    """Draw the weights, (1, 3) float32, with which a simulated sensor adds the colour channels."""
-    if happens(rng, ONE_COLOUR_SHARE):
-        return np.eye(3, dtype=np.float32)[[int(rng.integers(3))]]
-    weights = rng.normal(1 / 3, MIXTURE_DEVIATION, (1, 3)).astype(np.float32)
-    return weights / max(LEAST_WEIGHT, np.abs(weights).sum())
-
-
-def change_tones(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
-    """Change a view, (S, S) float32 in [0, 1], to what another sensor may see.
-
-    The result is a negative, a tone curve, a blend of two tone curves, or an image of edges.
-    """
-
-    def curve() -> np.ndarray:
-        tones = rng.random(int(rng.integers(*CURVE_TONES)))
-        tones = (tones - tones.min()) / (np.ptp(tones) + 1e-6)
-        return np.interp(view, np.linspace(0, 1, len(tones)), tones).astype(np.float32)
-
-    kind = rng.random()
-    if kind < TONES["negative"]:
-        return 1 - view
-    if kind < TONES["curve"]:
-        return curve()
-    if kind < TONES["curves"]:
-        field = smooth_noise(rng, len(view), NOISE_CELLS)
-        share = np.clip(0.5 + field / (2 * np.abs(field).max()), 0, 1)
-        return curve() * share + curve() * (1 - share)
-    smooth = cv2.GaussianBlur(view, (0, 0), rng.uniform(*EDGE_SIGMA_PX))
-    edges = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    edges = np.clip(edges / (np.quantile(edges, EDGE_QUANTILE) + 1e-3), 0, 1)
-    return 1 - edges if happens(rng, DARK_EDGES_SHARE) else edges
