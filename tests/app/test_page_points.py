@@ -15,7 +15,7 @@ from deepdetect import Keypoints, load_image
 from deepdetect.app.server import STATIC
 from deepdetect.detector.points.descriptor import describe_learned
 from deepdetect.detector.points.detection import detect_points, rank_candidates
-from deepdetect.features.learned import LEARNED_RATIO, match_learned, turn_descriptors
+from deepdetect.features.learned import RATIOS, match_learned, turn_descriptors
 from deepdetect.features.matchers import exact_neighbours, match_descriptors
 from deepdetect.io.image import luma
 
@@ -183,7 +183,8 @@ write([...rows0].flatMap((row0, k) => ratios[k] < RATIO ? [row0, rows1[k]] : [])
         width=0,
         height=0,
     )
-    match = partial(match_descriptors, matcher=exact_neighbours, ratio=LEARNED_RATIO, mutual=True)
+    limits = {"ratio": RATIOS["learned"], "mutual": True}
+    match = partial(match_descriptors, matcher=exact_neighbours, **limits)
     expected = match_learned(*features, match)
     pairs = set(zip(expected.indices0.tolist(), expected.indices1.tolist(), strict=True))
     common = pairs & {tuple(pair) for pair in found.reshape(-1, 2).astype(int).tolist()}

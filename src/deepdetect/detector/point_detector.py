@@ -56,10 +56,11 @@ class PointDetector:
             train-points`. None: the bundled file.
         descriptor: what describes the keypoints. "learned" is a small network that also sees the
             surroundings of a keypoint. "learned-free" was trained only on freely
-            licensed images. "cross-modal" is for images of different sensors, such as infrared and
-            visible light, or for maps. "rootsift" is for programs that expect SIFT descriptors. A
-            path is an ONNX file written by `deepdetect train-descriptor`. An object must have a
-            method `describe(image, keypoints)` like that of this class.
+            licensed images. "cross-modal" describes the strength of edges by "learned", for images
+            of different sensors, such as infrared and visible light, or for maps. "rootsift" is for
+            programs that expect SIFT descriptors. A path is an ONNX file written by `deepdetect
+            train-descriptor`. An object must have a method `describe(image, keypoints)` like that
+            of this class.
         backend, device, precision: as in `DeepDetect`, but only the values that mean ONNX Runtime
             on the CPU in float32 are allowed; others raise an OptionError.
         threads: maximum number of threads. None: one per processor.

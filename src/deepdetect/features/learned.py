@@ -18,10 +18,11 @@ freely licensed photographs. "cross-modal" is for images of different sensors, i
 bright may be swapped: "learned" descriptors of the strength of their edges. For your own weights,
 the type is "learned-" and the start of the SHA-256 of their file."""
 
-RATIO, LEARNED_RATIO, OTHER_LEARNED_RATIO = 0.85, 0.91, 0.88
-"""Limits of Lowe's ratio test: for descriptors that are not learned, for "learned", and for the
-other learned ones. On photos/val, each matches unrelated photographs as often as RootSIFT at 0.85,
-and is more precise on views of one photograph."""
+RATIO, LEARNED_RATIO = 0.85, 0.88
+RATIOS = {LEARNED: 0.91, CROSS_MODAL: 0.90}
+"""Limits of Lowe's ratio test: for descriptors that are not learned, for other learned ones, and by
+type. On photos/val, each matches unrelated photographs as often as RootSIFT at 0.85, and is more
+precise on views of one photograph."""
 
 LENGTH, CONSTANT = 64, 16
 """The first 16 of the 64 numbers of a learned descriptor do not change if the image is rotated."""
@@ -49,9 +50,8 @@ def is_learned(descriptor_type: str | None) -> bool:
 
 def ratio_limit(descriptor_type: str | None) -> float:
     """Return the default limit of Lowe's ratio test for descriptors of a type."""
-    if descriptor_type == LEARNED:
-        return LEARNED_RATIO
-    return OTHER_LEARNED_RATIO if is_learned(descriptor_type) else RATIO
+    default = LEARNED_RATIO if is_learned(descriptor_type) else RATIO
+    return RATIOS.get(str(descriptor_type), default)
 
 
 def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np.ndarray:

@@ -151,8 +151,8 @@ def match_features(
             least nine mutual neighbours, learned descriptors (not cross-modal) or RootSIFT, and
             keypoints with sizes and angles.
         ratio: maximum ratio of the descriptor distances to the nearest and the second-nearest
-            neighbour. None: 0.85, 0.91 for "learned", 0.88 for other learned descriptors, which is
-            as strict for each.
+            neighbour. None: 0.85, 0.91 for "learned", 0.9 for "cross-modal", 0.88 for other learned
+            descriptors, which is as strict for each.
         mutual: keep only mutual nearest neighbours.
         seed: seed of a matcher that is random.
 

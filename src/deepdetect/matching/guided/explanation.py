@@ -190,13 +190,13 @@ class Explanation:
             else:
                 flat = layer
                 break
+        part = None
+        if epipolar is not None and flat is not None:
+            least = 1 / 2 if flat.evidence.share >= NEARLY_ALL else MOST
+            part = None if _mostly(flat.hypothesis.inliers, epipolar.inliers, least) else flat
         if epipolar is not None and _mostly(refuted, epipolar.inliers, 1 / 2):
             epipolar = None  # it explains the same pattern
-        part = None
         if epipolar is not None:
-            if flat is not None:
-                least = 1 / 2 if flat.evidence.share >= NEARLY_ALL else MOST
-                part = None if _mostly(flat.hypothesis.inliers, epipolar.inliers, least) else flat
             epipolar = self._apart(pair, flats, epipolar)
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
             if tracks is not None:

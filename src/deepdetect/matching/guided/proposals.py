@@ -255,7 +255,7 @@ def matched_points(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...
     assert first.descriptors is not None
     assert second.descriptors is not None
     kind = first.descriptor_type
-    ratio = TENTATIVE_RATIO if kind == LEARNED else ratio_limit(kind)
+    ratio = TENTATIVE_RATIO if kind in (LEARNED, CROSS_MODAL) else ratio_limit(kind)
     match = partial(match_descriptors, matcher=exact_neighbours, ratio=ratio, mutual=True)
     if is_learned(first.descriptor_type):
         matches = match_learned(first, second, match)
