@@ -5,7 +5,7 @@ give. Each match ends at a sub-pixel position, not at a keypoint.
 
 A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
 are tracked from one view to the other, starting from the matches of the rows, and the matrix is
-fitted to the tracks. The images are rectified again if the new epipolar lines differ from the rows.
+fitted to the tracks.
 
 The constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, unless noted.
 """
@@ -30,7 +30,6 @@ from ...geometry.images import (
 )
 from ...geometry.semi_calibrated import refine_fundamental
 from ...geometry.transforms import (
-    epipolar_errors,
     scaled_fundamental,
     scaled_homography,
     scaled_points,
@@ -71,10 +70,6 @@ CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
 MIN_CORRELATION = 0.3
 """Geometry relies on a match if the correlation of its windows is at least this. With less, it is
 kept if the correlation is above 0: chance gives as many below as above."""
-
-MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
-"""The images are rectified again if fewer than the second fraction of the tracked corners have
-their rows within the first distance of the refined epipolar lines. Chosen on Oxford and others."""
 
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 """Maximum number of tracked corners, and side of their windows. Chosen on Oxford and others."""
@@ -146,22 +141,11 @@ def match_by_rectification(
     found = _best_view(grays, sparse, fundamental, plane)
     if found is None:
         return None
-    view, (tracked, on_rows) = found
+    view, tracked = found
     fundamental = refine_fundamental((sparse, tracked), fundamental, sizes)
-    row_error = np.quantile(epipolar_errors(tracked[0], on_rows, fundamental), ROW_QUANTILE)
-    if row_error > MAX_ROW_ERROR_PX:
-        again = rectified_view(grays, tracked, fundamental, plane)
-        tracks = None if again is None else _track(again)
-        if again is not None and tracks is not None:
-            counts = [np.count_nonzero(each.relied) for each in (view, again)]
-            if counts[1] >= counts[0]:
-                view, row_error = again, 0.0
-                fundamental = refine_fundamental((sparse, tracks[0]), fundamental, sizes)
     if _agreement(view, sparse) < MIN_AGREEMENT:
         return None
-    # If the rows still do not fit the matrix, only matches that geometry relies on are kept.
-    near = row_error * view.scale < MAX_ROW_ERROR_PX
-    rows, ends, scores = _sample(view, xy0, relied_only=not near)
+    rows, ends, scores = _sample(view, xy0)
     ends = _moved_to_lines(xy0[rows], ends, fundamental)
     inside = ((ends > -0.5) & (ends < np.array(sizes[1]) - 0.5)).all(axis=1)
     return fundamental, GuidedMatches(rows[inside], ends[inside], scores[inside], subpixel=True)
@@ -169,7 +153,7 @@ def match_by_rectification(
 
 def _best_view(
     grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None
-) -> tuple[RectifiedView, tuple[Pair, np.ndarray]] | None:
+) -> tuple[RectifiedView, Pair] | None:
     """Return the view that matches most, and its tracks: of all disparities, or near a plane."""
     ways, best, most = [sparse], None, 0.0
     if plane is not None:
@@ -300,11 +284,10 @@ def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
     return max(math.floor(smallest), -widest), min(math.ceil(largest), widest)
 
 
-def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
+def _track(view: RectifiedView) -> Pair | None:
     """Track corners to the second view, starting from the matches of the rows.
 
-    Returns the corners in both images at full size, and the ends of their tracks moved to the rows
-    where the tracks start, as row matching assumes; None with fewer than `MIN_TRACKS` tracks.
+    Returns the corners in both images at full size; None with fewer than `MIN_TRACKS` tracks.
     """
     first, second = (equalise(gray) for gray in view.views)
     mask = view.relied.astype(np.uint8)
@@ -323,8 +306,7 @@ def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
     if np.count_nonzero(good) < MIN_TRACKS:
         return None
     start, ends = start[good], ends[good]
-    on_rows = np.column_stack([ends[:, 0], start[:, 1]])
-    return (view.from_frame(start, 0), view.from_frame(ends, 1)), view.from_frame(on_rows, 1)
+    return view.from_frame(start, 0), view.from_frame(ends, 1)
 
 
 def _agreement(view: RectifiedView, sparse: Pair) -> float:
@@ -351,14 +333,9 @@ def _moved_to_lines(
     return np.asarray(points1 - normal * (distance / squared)[:, None])
 
 
-def _sample(
-    view: RectifiedView, xy0: np.ndarray, *, relied_only: bool = False
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices of keypoints that have a disparity, their partners and their scores.
-
-    With `relied_only`, only those that geometry relies on.
-    """
-    disparity = np.where(view.relied, view.disparity, np.nan) if relied_only else view.disparity
+def _sample(view: RectifiedView, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the indices of keypoints that have a disparity, their partners and their scores."""
+    disparity = view.disparity
     height, width = disparity.shape
     positions = view.to_frame(xy0, 0)
     rows, column, row = view.pixels_of(positions)
