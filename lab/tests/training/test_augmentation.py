@@ -20,6 +20,7 @@ from deepdetect_lab.training.augmentation import (
     augment,
     darken,
     draw_darkening,
+    draw_exposure,
     rotate_hue,
     transpose,
 )
@@ -70,8 +71,15 @@ def test_a_darkened_photograph_is_of_low_visibility(name: str, photos: dict) -> 
 def test_the_widest_image_is_of_low_visibility_too(seed: int) -> None:
     generator = np.random.default_rng(seed)
     extreme = generator.choice(np.array([0, 255], np.uint8), (16, 16, 3))
-    dark = darken(extreme, draw_darkening(generator))
-    assert visibility_of(luma(dark)) == "low"
+    for draw in (draw_darkening, draw_exposure):
+        assert visibility_of(luma(darken(extreme, draw(generator)))) == "low"
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_short_exposure_keeps_its_contrast(seed: int) -> None:
+    bright = np.linspace(0, 255, 3 * 64).astype(np.uint8).reshape(8, 8, 3)
+    exposure = draw_exposure(np.random.default_rng(seed))
+    np.testing.assert_allclose(darken(bright, exposure), bright * exposure.brightness, atol=1)
 
 
 @given(
