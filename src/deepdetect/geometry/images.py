@@ -270,10 +270,6 @@ def equalise(gray: np.ndarray) -> np.ndarray:
     return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)
 
 
-WINDOWS_AT_ONCE = 4096
-"""`zncc_at_points` processes at most this number of windows at once, which bounds the memory."""
-
-
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99
 """EDGE_SIGMA_PX is the sigma of the blur before the gradient is computed. Gradient lengths are
 scaled so that their quantile EDGE_QUANTILE becomes white (255). Both were chosen by hand."""

@@ -66,9 +66,8 @@ from .misplaced import correct_places
 from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
-MAX_EXHAUSTIVE, COMPARED_IMAGES = 50, 16
-"""The choice "auto" matches all pairs of images if there are at most the first number. An overlay
-is looked for in the second number of images, the first by name. Chosen by hand."""
+MAX_EXHAUSTIVE = 50
+"""The choice "auto" matches all pairs of images if there are at most this number."""
 
 WORK = "work"
 """Name of the folder of intermediate results, inside the output folder."""
