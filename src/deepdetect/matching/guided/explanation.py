@@ -101,7 +101,7 @@ class Explanation:
     ) -> None:
         self._pair, self._asked, self._seed = pair, asked, seed
         self.pixels = np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)
-        self._sources = Sources(pair, given, keypoints)
+        self._sources = Sources(pair, given)
         self._judges: dict[bool, tuple[ImagePair, Judge]] = {}
         self.tried = Tentative(np.empty((0, 2)), np.empty((0, 2)))
         self.best_nfa = np.inf

@@ -34,9 +34,8 @@ DENSE_SIDE_PX, DENSE_KEYPOINTS = 1280, 8192
 """A later source uses larger images and more points, because that finds twice as many correct
 matches where few are correct."""
 
-GIVEN_SIDE_PX, GIVEN_KEYPOINTS, MIN_POINTS = 1200, 4000, 1000
-"""The caller's points, in images of this side and at most this number of them, are the first source
-if each image has MIN_POINTS of them. Fewer would find less than our own."""
+GIVEN_SIDE_PX = 1200
+"""Positions of the caller are taken to be as exact as in images of this longer side."""
 
 VIEWED_SIDE_PX, VIEWED_KEYPOINTS = 320, 1000
 """Oblique views are simulated from images of this side with this number of points, and have half
@@ -132,19 +131,12 @@ class Hypothesis:
 class Sources:
     """Tentative matches of a pair, each source asked only once, and only when it is wanted."""
 
-    def __init__(
-        self,
-        pair: ImagePair,
-        given: Pair | None = None,
-        keypoints: tuple[Keypoints, Keypoints] | None = None,
-    ) -> None:
-        self._pair, self._given, self._keypoints = pair, given, keypoints
+    def __init__(self, pair: ImagePair, given: Pair | None = None) -> None:
+        self._pair, self._given = pair, given
 
     def __iter__(self) -> Iterator[Tentative]:
         if self._given is not None:
             yield self._of_positions(self._given)
-        elif self._keypoints is not None:
-            yield from self._of_points(self._keypoints)
         yield self.learned
         yield self._cross_modal()
         yield self.dense
@@ -223,18 +215,6 @@ class Sources:
         scaled = [scaled_points(p, s) for p, s in zip(positions, scales, strict=True)]
         kept = separate(*scaled, np.arange(len(scaled[0])))[2]
         return Tentative(positions[0][kept], positions[1][kept], 1 / scales[1])
-
-    def _of_points(self, given: tuple[Keypoints, Keypoints]) -> Iterator[Tentative]:
-        few = min(len(each) for each in given) < MIN_POINTS
-        if few or any(each.sizes is None or each.angles is None for each in given):
-            return
-        views, (_, scale1) = self._pair.both(GIVEN_SIDE_PX)
-        first, second = (
-            describe_learned(view, points[:GIVEN_KEYPOINTS])
-            for view, points in zip(views, given, strict=True)
-        )
-        points0, points1, _ = matched_points(first, second)
-        yield Tentative(points0, points1, 1 / scale1)
 
 
 def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
