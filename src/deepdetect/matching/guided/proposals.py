@@ -138,8 +138,8 @@ class Sources:
         if self._given is not None:
             yield self._of_positions(self._given)
         yield self.learned
-        yield self._cross_modal()
         yield self.dense
+        yield self._cross_modal()
         yield self._views()
 
     @cached_property
