@@ -38,7 +38,7 @@ MIN_TRACKS, SQUARES = 15, 8
 """A homography is fitted to at least this number of tracks. The chessboard has this many squares
 along the longer side."""
 
-MAX_PARALLAX = 0.06
+MAX_PARALLAX = 0.1
 """Tentative matches farther from the plane than this fraction of the longer side are not tracked:
 the views are too unlike."""
 
