@@ -18,7 +18,7 @@ from ..features.keypoints import Keypoints
 from ..features.matches import Evidence, Layer, Matches, TwoViewGeometry
 
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
-"""These attributes of keypoints may be None. An npz file contains those that are not."""
+"""These attributes of keypoints may be None. An npz file contains those that are not None."""
 
 MATCH_VALUES = (
     *("points0", "points1", "scores", "inliers", "subpixel", "indices0", "indices1", "layer"),
@@ -157,7 +157,7 @@ def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
     except Exception as error:  # NumPy and the zip decoders raise many types of errors
         missing = "it has no array " if isinstance(error, KeyError) else ""
         raise InvalidFileError(
-            f"{path} contains no {content} ({missing}{first_line(error)}): give a file of them"
+            f"{path} contains no {content} ({missing}{first_line(error)}): give a file of {content}"
         ) from error
 
 
