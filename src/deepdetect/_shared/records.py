@@ -146,7 +146,7 @@ class Outputs:
         for path, record in zip(self.paths, records, strict=True):
             if not record or not record["digest"] or list(file_state(path)) == record["state"]:
                 continue
-            if file_digest(path) != record["digest"]:  # else only the time differs, as for a copied file
+            if file_digest(path) != record["digest"]:  # a copied file only has another time
                 raise OptionError(f"{path} exists, and was changed after it was made: {ADVICE}")
         states = [list(file_state(path)) for path in self.inputs]
         done = all(record and record["whole"] and record["states"] == states for record in records)

@@ -34,8 +34,8 @@ PLACES = re.compile(rb"<GeoTransform>|<GeodataXform|<GCPList|gml\.data|\xb1\x4b\
 MAX_HEADER_BYTES = 1 << 20
 """PLACES finds a georeference in the first MAX_HEADER_BYTES of .aux.xml and JPEG 2000 files."""
 
-NO_MATRIX = "the georeference of an image is not kept, since GDAL reads no affine matrix from it: \
-warp an image with ground control points or RPCs by gdalwarp first"
+NO_MATRIX = "the place (georeference) of an image is not kept, since GDAL reads no affine matrix \
+from it: warp an image with ground control points or RPCs by gdalwarp first"
 NO_SYSTEM = "a GeoTIFF without a coordinate system is treated as a local grid: assign the system \
 by gdal_edit.py -a_srs if you know it"
 

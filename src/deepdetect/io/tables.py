@@ -157,7 +157,7 @@ def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
     except Exception as error:  # NumPy and the zip decoders raise many types of errors
         missing = "it has no array " if isinstance(error, KeyError) else ""
         raise InvalidFileError(
-            f"{path} contains no {content} ({missing}{first_line(error)}): give a file of {content}"
+            f"{path} contains no {content} ({missing}{first_line(error)}): give a file of them"
         ) from error
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from .._shared.opencv import cv2
 
 MAX_CIRCLES, LEAST_RADIUS_PX = 5000, 2.0
-"""More than MAX_CIRCLES keypoints are drawn as single pixels, since circles would cover the image. A
-circle has at least the radius LEAST_RADIUS_PX, or 1 pixel more if its keypoint has no size."""
+"""More than MAX_CIRCLES keypoints are drawn as single pixels, since circles would cover the image.
+A circle has at least the radius LEAST_RADIUS_PX, or 1 pixel more if its keypoint has no size."""
 
 PICTURE_SIDE_PX = 2000
 """Longest side of a visualisation, in pixels. A JPEG of it then takes less than two megabytes."""
