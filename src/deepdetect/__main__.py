@@ -21,8 +21,8 @@ STOPPED = 130
 
 def main() -> None:
     """Run the command line; Ctrl-C ends it with exit code 130, even during imports."""
-    # Closed standard streams are opened. Otherwise a file could get the descriptor of one, and what
-    # libraries print would be written into that file.
+    # A closed standard stream is opened as the null device. Otherwise a file could get its number,
+    # and what libraries print would be written into that file.
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(number)

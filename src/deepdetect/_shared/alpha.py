@@ -1,7 +1,7 @@
-"""Transparent pixels: they are filled with grey, so that they show nothing, and are told apart.
+"""Transparent pixels: they are filled with grey, and a fourth channel of the image marks them.
 
-Inside the package, an image with transparent pixels has a fourth channel, which is 0 there, and the
-largest value of its type elsewhere.
+Inside the package, an image with transparent pixels has a fourth channel. It is 0 at transparent
+pixels, and the largest value of its data type at all others.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from .opencv import cv2
 def on_grey(
     rgb: np.ndarray, alpha: np.ndarray, opaque: float, name: str, *, associated: bool = False
 ) -> np.ndarray:
-    """Blend a (H, W, 3) uint8 or uint16 image with grey by its alpha, (H, W), white at `opaque`.
+    """Blend an (H, W, 3) uint8 or uint16 image with grey by its (H, W) alpha, from 0 to `opaque`.
 
-    If `associated`, the colours are multiplied by alpha already. Pixels that are more ground than
-    image count as transparent. If there are any, the result has the fourth channel.
+    If `associated`, the colours are already multiplied by alpha. Pixels with alpha below half of
+    `opaque` count as transparent, and the fourth channel of the result marks them.
     """
     if (alpha >= opaque).all():
         return rgb
@@ -47,7 +47,7 @@ def opaque_part(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def continued(pixels: np.ndarray) -> np.ndarray:
-    """Give transparent pixels the colours of the nearest opaque ones, so that warps have no rim."""
+    """Fill transparent pixels with the nearest opaque colour, so that warps have no grey rim."""
     rgb, hidden = opaque_part(pixels)
     if hidden is None:
         return pixels

@@ -19,8 +19,8 @@ from pathlib import Path
 from .errors import DeepDetectError
 
 ABANDONED_S, STEM_LENGTH = 24 * 3600.0, 40
-"""A temporary file of another machine is removed at this age, in seconds. A temporary name has up
-to this many characters of the final name, because file systems limit names."""
+"""Temporary files of other machines are removed after ABANDONED_S seconds. Temporary names contain
+up to STEM_LENGTH characters of the final name, because file systems limit the length of names."""
 
 # The owner in a temporary name is a machine, a process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
@@ -97,8 +97,8 @@ def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
 def _has_ended(path: Path, machine: str, process: str) -> bool:
     """Return whether the process that made a file or folder has ended.
 
-    A process on another machine, or on Windows, cannot be checked. It counts as ended if the file
-    is older than `ABANDONED_S`.
+    A process on another machine, or on Windows, cannot be checked. Such a process counts as ended
+    if its file is older than `ABANDONED_S` seconds.
     """
     try:
         if machine != _machine() or os.name != "posix":

@@ -62,9 +62,9 @@ def array_to_pixels(
     """Convert an array or PyTorch tensor to an (H, W, 3) RGB image, or (H, W, 4) as in `alpha`.
 
     The result is uint8 or, if `deep` is set and the input has more than 8 bits, uint16. `white` is
-    the value of white in an unsigned image, if known. `call` is the range of the uint16 images of a
-    call that state no white; `counts`, to which their values are added, serves to find it. `name`
-    is the image's name in messages. The other arguments are as in `load_image`.
+    the value of white in an unsigned image, if known. `call` is the common value range of the
+    uint16 images of a call whose white is unknown. If `counts` is given, the histogram of such an
+    image is added to it. Messages call the image `name`. Other arguments are as in `load_image`.
 
     Raises:
         ImageError: the image has an unsupported shape, type or range, or contains NaN.
@@ -89,7 +89,7 @@ def array_to_pixels(
     if array.shape[2] < 4:
         return rgb
     alpha = array[:, :, 3]
-    # The largest alpha of a deep image is opaque, since sensors of 12 bits may end at 4095.
+    # In a deep image, the largest alpha counts as opaque, since 12-bit values end at 4095.
     opaque = 255 if array.dtype == np.uint8 else max(alpha.max(), 1)
     return on_grey(rgb, alpha, opaque, name)
 
@@ -102,12 +102,12 @@ def deep_values(image: Any) -> np.ndarray:
 
 
 def to_8_bits(rgb: np.ndarray, value_range: Sequence[float] = (0, 65535)) -> np.ndarray:
-    """Convert a uint8 or uint16 image to uint8; the range is that of a uint16 image."""
+    """Convert an image to uint8; `value_range` is black and white of a uint16 image."""
     return rgb if rgb.dtype == np.uint8 else _in_range(rgb, value_range, "", False)
 
 
 def from_16_bits(image: np.ndarray, value_range: Sequence[float]) -> np.ndarray:
-    """Turn uint16 pixels, read with this range, back into the values of their image, uint16."""
+    """Convert uint16 pixels that were read with `value_range` back to their values in the file."""
     low, high = value_range
     levels = np.arange(65536) * ((high - low) / 65535) + low
     return np.rint(levels.clip(0, 65535)).astype(np.uint16)[image]
@@ -191,7 +191,7 @@ def _range_of(
 
 
 def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
-    """Scale to uint8 or uint16; `value_range` gives the values that become black and white."""
+    """Scale an array to uint8 or uint16; the ends of `value_range` become black and white."""
     (low, high), size = value_range, array.dtype.itemsize
     if array.dtype == np.uint8 and (low, high) == (0, 255):
         return array

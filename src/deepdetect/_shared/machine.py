@@ -33,8 +33,8 @@ Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
 PARTS_PER_THREAD, TASKS_PER_WORKER = 4, 8
-"""`parallel_for` makes this many parts per thread, and `map_in_processes` queues this many tasks
-per worker, so that none idles. Chosen by hand."""
+"""`parallel_for` divides work into PARTS_PER_THREAD parts per thread, and `map_in_processes` queues
+TASKS_PER_WORKER tasks per worker, so that no thread or worker idles. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
 """If the work is interrupted or fails, running workers are killed after this many seconds."""
@@ -56,10 +56,10 @@ BYTES_PER = {
 }
 """Measured bytes of memory that each item needs; `needed_memory` multiplies them by counts."""
 
-# M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no block is mapped on its own, and the
-# heap is never trimmed, and grows in steps of 256 MB.
+# Options of glibc's `mallopt`: M_MMAP_MAX 0 maps no block on its own, M_TRIM_THRESHOLD -1 never
+# trims the heap, and M_TOP_PAD lets it grow in steps of 256 MB.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
-_MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
+_MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD: blocks from 1 MB on are mapped on their own
 
 _max_threads: int | None = None
 """`parallel_for` uses at most this number of threads in this process; None: one per processor."""
@@ -161,7 +161,7 @@ def _one_thread_inherited() -> Iterator[None]:
 
 
 def recorded(function: Callable[[Task], Outcome], task: Task) -> tuple[Outcome, list[str]]:
-    """Return the outcome of a task, and the warnings for users that `told` repeats elsewhere."""
+    """Run a task; return its outcome and its user warnings, which `told` repeats later."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         outcome = function(task)

@@ -1,6 +1,6 @@
 """OpenCV, imported at its first use, from whichever of its PyPI packages is installed.
 
-The packages share one folder `cv2`, so a package overwrites the files of one installed before. The
+These packages share one folder `cv2`, so installing one overwrites the files of another. The
 modules of DeepDetect write `from .._shared.opencv import cv2`.
 """
 

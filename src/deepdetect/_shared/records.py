@@ -88,7 +88,7 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def check_same(place: Path, before: object, now: Mapping[str, Any], advice: str = ADVICE) -> None:
-    """Raise an OptionError if an existing output has no settings, or other ones than this run.
+    """Raise an OptionError unless an existing output was made with the settings of this run.
 
     `before` are the settings of the output, `now` those of this run, both as `plain` returns them.
     """
@@ -146,7 +146,7 @@ class Outputs:
         for path, record in zip(self.paths, records, strict=True):
             if not record or not record["digest"] or list(file_state(path)) == record["state"]:
                 continue
-            if file_digest(path) != record["digest"]:  # copied files only have other times
+            if file_digest(path) != record["digest"]:  # a copied file only has another time
                 raise OptionError(f"{path} exists, and was changed after it was made: {ADVICE}")
         states = [list(file_state(path)) for path in self.inputs]
         done = all(record and record["whole"] and record["states"] == states for record in records)
@@ -244,7 +244,7 @@ def inputs_of(path: Path) -> list[str]:
 
 
 def was_made(path: Path, root: Path) -> bool:
-    """Return whether a file below `root` is a recorded output, or lies in a folder that is one."""
+    """Return whether a file below `root`, or a folder that contains it, is a recorded output."""
     return path != root and (_record(path).is_file() or was_made(path.parent, root))
 
 
@@ -272,7 +272,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
 
 @contextmanager
 def lock(path: Path, final: Path) -> Iterator[None]:
-    """Hold the lock file `path` of `final`; raise an OptionError if another process holds it.
+    """Lock `final` by the lock file `path`; raise an OptionError if another process holds the lock.
 
     On Windows, and in network folders without locks, nothing is locked.
     """

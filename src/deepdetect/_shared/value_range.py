@@ -1,4 +1,4 @@
-"""The values of black and white in uint16 images that do not state them, one range for a call."""
+"""Black and white of uint16 images that do not state them: one value range for each call."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 
 SENSOR_BITS = (8, 10, 12, 14, 16)
-"""Bit depths of sensors. A uint16 image is assumed to have the smallest that holds its values."""
+"""Bit depths of sensors. The smallest that holds the values of a uint16 image is assumed."""
 
 LITTLE_RANGE = 1 / 8
 """An image that uses less than this fraction of its range causes a warning, because few grey levels
@@ -24,7 +24,7 @@ ValueRange = tuple[float, float]
 def range_of_uint16(array: np.ndarray, name: str, call: ValueRange | None) -> ValueRange:
     """Return the values of black and white of a uint16 image that does not state them.
 
-    They are those of all images of the `call`, if it has several.
+    If a call has several images, these are the ends of their common range, which is `call`.
     """
     counts = counts_of(array)
     if call is None:
@@ -32,7 +32,7 @@ def range_of_uint16(array: np.ndarray, name: str, call: ValueRange | None) -> Va
     low, high = map(round, call)
     outside = (counts[1 : max(1, low)].sum() + counts[high + 1 : -1].sum()) / counts.sum()
     if outside > MAX_OUTLIERS:
-        what = f"{outside:.1%} of {name} lies outside {low} to {high}, the range of other images"
+        what = f"{outside:.1%} of {name} lies outside the images' common range, {low} to {high}"
         warnings.warn(f"{what}: give the range by `value_range`", UserWarning, stacklevel=2)
     return call
 
@@ -45,10 +45,10 @@ def counts_of(values: np.ndarray) -> np.ndarray:
 def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
     """Find the values of black and white from the counts of all 65536 values.
 
-    White is the largest value of a sensor. Few pixels above it, and padding with 65535, are left
-    out if the octave above it is empty: highlights would lie there. Black is 0. But a narrow band
-    of values that lies farther from 0 than it is wide is spread over all grey levels, as far as
-    each value has a level of its own. With a `name`, little use of the range causes a warning.
+    White is the largest value of a depth in `SENSOR_BITS`. A few pixels above it, and padding with
+    65535, are ignored if no value lies in the octave above white, where highlights would lie. Black
+    is 0. But a narrow band of values that is farther from 0 than it is wide is spread over the grey
+    levels, at most one level per value. With a `name`, little use of the range causes a warning.
     """
     levels = np.flatnonzero(counts)
     full = _white_above(levels.max(initial=0))

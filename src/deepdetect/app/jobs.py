@@ -1,4 +1,4 @@
-"""Running tasks: each has a process and a folder until the page stops sending requests for it."""
+"""Running the page's tasks: each has a process and a folder until the page asks for it no more."""
 
 from __future__ import annotations
 

@@ -316,7 +316,7 @@ class AppServer:
         return Response(await run_in_threadpool(answer), media_type="application/octet-stream")
 
     async def _new_job(self, request: Request) -> Response:
-        """Start a task. The body is the length of a JSON text in 4 bytes, the text, and images."""
+        """Start a task. The body is the length of a JSON text (4 bytes), the text, and images."""
         self._check_key(request)
         kind, options = request.query_params.get("kind", ""), self.options
         if kind not in TASKS:

@@ -1,8 +1,8 @@
 """Engines that run the tasks of a collection: processes of this machine, or a Ray cluster.
 
 To add an engine, write a function with the signature of `map_in_processes` and add it to `ENGINES`.
-Ray repeats the tasks of a worker that dies, so a task may run twice. What runs a task must
-therefore write each file under a temporary name, and rename it when it is complete.
+Ray repeats the tasks of a worker that dies, so a task may run twice. Each task must therefore write
+its files under temporary names, and rename a file when it is complete.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAX_BLOCKS = 4096
 
 PROCESSORS_PER_WORKER = 0.5
 """Each worker reserves only this fraction of a processor in Ray, so that half of the machines can
-take over all workers, for which tasks would otherwise wait forever."""
+take over all workers. Otherwise tasks would wait forever for workers without a processor."""
 
 OBJECT_STORE_BYTES = 200_000_000
 """Shared memory of a cluster that this module starts: little, because results go to files."""

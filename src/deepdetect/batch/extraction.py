@@ -74,7 +74,7 @@ def extract_features(
             because every process has a detector of its own.
         selection: which pixels of a `DeepDetect` heat map become keypoints; None: those with a
             probability above 0.5.
-        ignore: (H, W) array, or one for each size, true where images of this size get no keypoint.
+        ignore: (H, W) mask, or one for each image size, true where keypoints are not wanted.
         max_megapixels: limit for an image, as in `load_image`; larger images count as failures.
         engine: "processes" for processes on this machine, or "ray" for a Ray cluster.
         workers: number of processes; default: one per processor.
@@ -133,7 +133,7 @@ def extract_features(
 
 
 def noted_range(path: str | Path) -> ValueRange | None:
-    """Return the range by which the uint16 images of a file of features were read, if it has one.
+    """Return the value range by which uint16 images were read for a features file, or None.
 
     Images that are added later are read by the same range.
     """

@@ -47,8 +47,8 @@ FORMAT = ("v110", "v110")
 """Oldest and newest file format to write: HDF5 1.10 (2016), in which large groups are fast."""
 
 MIN_SHARDS, LARGEST_SHARD = 256, 32
-"""There are at least this many shards if there are enough inputs, to keep workers busy. A shard has
-at most this many inputs, because a killed worker loses its shard. Chosen by hand."""
+"""Many inputs make at least MIN_SHARDS shards, which keeps workers busy. A shard has at most
+LARGEST_SHARD inputs, because a killed worker loses its shard. Chosen by hand."""
 
 State = tuple[int, ...]
 """State of an input: whole numbers that change if the input changes, such as size and time."""
@@ -196,8 +196,8 @@ def fill_file(
     An existing file must have the same `settings`. Shards of an interrupted run with the same
     settings are used. `wanted` maps each input to the groups that may hold its result, and each of
     these groups to the state of the input. If the file has none of the groups in this state, the
-    first one is made. Any other group, or a group of an input that fails, stays only if
-    `others_stay` returns True for the name of the group.
+    first of them is made. A group that is not wanted, or whose input fails, stays in the file only
+    if `others_stay` returns True for the name of the group.
     """
     import_h5py()
     map_tasks, work = look_up("engine", engine, ENGINES), partial(_write_shard, make=make)
@@ -235,7 +235,7 @@ def fill_file(
         counts, failures = dict[Any, int](), list[str]()
         size = min(LARGEST_SHARD, max(1, len(left) // MIN_SHARDS))
         parts = [left[k : k + size] for k in range(0, len(left), size)]
-        # A digest of the names of its inputs names the file of each shard.
+        # The file of a shard is named by a digest of the names of the shard's inputs.
         tasks = [(shards / f"{key([name for name, _ in part])}.h5", part) for part in parts]
         with progress(len(wanted), of, of.removesuffix("s"), quiet, skipped) as bar:
             for made, failed in map_tasks(work, tasks, workers):

@@ -114,7 +114,7 @@ def match_pairs(
             name), "similar:20" or "similar" (each image with the 20 most similar ones, by VLAD of
             their best 512 keypoints), a list of pairs of names, or a text file with a pair on each
             line. A pair listed twice, in either order, counts once. Pairs of an earlier run stay in
-            the file, also if new images change which ones are most similar.
+            the file, even if new images change which images are most similar.
         path: the HDF5 file to write.
         options: how pairs are matched.
         engine: "processes" for processes on this machine, or "ray" for a Ray cluster.
@@ -167,7 +167,7 @@ def match_pairs(
 
 
 def first_keypoints(features: Path) -> Keypoints | None:
-    """Return the first undamaged keypoints in a file, or None; all of a file are of one kind."""
+    """Return a file's first undamaged keypoints, or None; all its keypoints are of one kind."""
     with open_hdf5(features) as file:
         for name in feature_names(file):
             with suppress(InvalidFileError):

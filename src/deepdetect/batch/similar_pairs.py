@@ -29,7 +29,7 @@ WORDS, DESCRIPTORS_OF_WORD = 64, 8
 training descriptors on average. Chosen by hand."""
 
 TRAINING_IMAGES, TRAINING_DESCRIPTORS, KMEANS_ITERATIONS = 500, 50_000, 10
-"""The vocabulary is trained on at most these numbers of images and descriptors, to save time."""
+"""Maximum number of images, descriptors and k-means iterations for the vocabulary, to save time."""
 
 COMPARED_ROWS = 256
 """This many images are compared at once with all others, which takes 300 MB for 100,000 images."""

@@ -80,7 +80,7 @@ LAB_ENTRY_POINTS = "deepdetect.commands"
 table like `COMMANDS`, but with full module names; `dev` has the commands `deepdetect dev NAME`."""
 
 LAB_COMMANDS = ("label", "train", "train-descriptor", "dev")
-"""Commands of deepdetect-lab. If it is not installed, calling one gives an error that says so."""
+"""Commands of deepdetect-lab. Calling one gives an error if deepdetect-lab is not installed."""
 
 Commands = Mapping[str, Mapping[str, tuple[str, str]]]
 
@@ -223,7 +223,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _usage(error: CycloptsError) -> str:
-    """Return a sentence on a command line that does not fit the command."""
+    """Return the error message for a command line that does not fit its command."""
     if not isinstance(error, MissingArgumentError | UnusedCliTokensError):
         return " ".join(str(error).split())
     chain = error.command_chain or ()
@@ -250,7 +250,7 @@ def _call(words: Sequence[str]) -> int:
         importlib.import_module(module)  # cyclopts' own import would hide errors
     FORMATTER.shows_all = "--help-all" in words
     meant = {"--help-all": ["--help"], "-": ["/dev/stdin"]}
-    # The shell of Windows passes patterns on, and so does every shell if they are in quotes.
+    # The shell of Windows does not expand patterns such as *.jpg, and no shell does in quotes.
     words = [
         each
         for word in words

@@ -52,8 +52,8 @@ def chosen_detector(
 ) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
     """Return the detector `kind` and its selection options, which are None for "points".
 
-    The options of both detectors are taken out of `values`. `options` names those of "points".
-    Defaults are `max_keypoints` for "points", and `defaults` for the network.
+    The options of both detectors are removed from `values`; `options` lists the options of
+    "points". `max_keypoints` is the default for "points", and `defaults` are those for the network.
     """
     network, points, selection = (source.take(values) for source in (NETWORK, options, SELECTION))
     if kind == "points":

@@ -23,13 +23,13 @@ PURPOSES = {
     "sfm": "reconstruct with three or more images, extract, match-many, export, georeferences",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
-"""Two back ends may differ by this much in their probabilities, five times what is usual."""
+"""Probabilities of two back ends may differ by this much: five times the usual difference."""
 TIMED_ROUNDS = 5
 """The benchmark times this many runs, after a first one that compiles. Chosen by hand."""
 NEAR_SHIFT_PX = 16
 """Disparity in pixels of the foreground in the second pair of the self-test. Chosen by hand."""
 MIN_PRECISION = 0.95
-"""The self-test fails below this fraction of correct matches. Usually it is 1. Chosen by hand."""
+"""The self-test fails below this fraction of correct matches; 1 is usual. Chosen by hand."""
 
 
 class Finding(NamedTuple):

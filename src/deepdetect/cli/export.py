@@ -144,7 +144,7 @@ def hloc(
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
-    """Return an export's marker file; if it is missing, only `overwrite` allows other files."""
+    """Return an export's marker file; raise an error if its folder has only other files."""
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")
@@ -169,7 +169,7 @@ def _export(
     cli.check_outputs([marker], inputs)
     of_folder = len(sources) == 1 and sources[0].is_dir()
     if sources[0].is_file() and sources[0].suffix.lower() not in (".npz", ".h5", ".hdf5"):
-        find_images(sources[0])  # fails, with advice
+        find_images(sources[0])  # raises an error with advice
     saved, points = SAVED.take(values), MAX_KEYPOINTS.take(values)
     for name in saved if of_folder else (*points, *values):
         what = "saved files" if of_folder else "a folder of images"

@@ -91,8 +91,8 @@ def match(
         unguided: Match by descriptors alone over the whole image, then estimate a geometry.
         homography: Text file with a known 3x3 homography from the first image to the second.
             Matches that agree with it are the inliers.
-        camera0: Text file with the 3x3 matrix of the first camera, for --model essential.
-        camera1: Text file with the 3x3 matrix of the second camera.  [default: camera0]
+        camera0: Text file with the 3x3 intrinsic matrix of camera 0, for --model essential.
+        camera1: Text file with the 3x3 intrinsic matrix of camera 1.  [default: camera0]
         pictures: Also write a visualisation.
     """
     many = len(images) != 2 or any(path.is_dir() for path in images)
@@ -160,7 +160,7 @@ def match(
 
 
 def _named(text: object, images: Sequence[Path]) -> str:
-    """Replace indices of images by their names."""
+    """Replace each `images[N]` in a message by the path of that image."""
     return re.sub(r"images\[(\d+)\]", lambda found: str(images[int(found[1])]), str(text))
 
 
@@ -223,7 +223,7 @@ def _choose_pairs(
             f"{name} in {pairs} is not one of the images: give its path relative to the folder"
         )
     if not wanted:
-        load_image(min(paths.values()))  # fails for a video, with advice
+        load_image(min(paths.values()))  # raises an error with advice if it is a video
         raise OptionError("one image makes no pair: give two or more images, or a folder")
     stems = {path: stem.replace("/", "-") for path, stem in cli.result_stems(paths).items()}
     chosen = [(paths[name0], paths[name1]) for name0, name1 in wanted]
@@ -295,7 +295,7 @@ def register(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Register the second image to the first, if both show one plane or are from one place.
+    """Register the second image to the first, if both show one plane or were taken from one place.
 
     Writes STEM1_on_STEM0.png (the second image warped into the frame of the first), both images
     combined as _checkerboard.png and _difference.png, and _homography.txt (3x3, from the first
@@ -426,7 +426,7 @@ def stitch(
         (first, second), distance = max(panorama.parallax.items(), key=lambda item: item[1])
         cli.say(
             f"{images[first]} and {images[second]} differ by {distance:.0f} pixels along their "
-            "seam, because the camera moved: rotate it about its lens, or avoid near objects"
+            "seam, because the camera moved: rotate it only about its lens, or avoid near objects"
         )
     height, width = panorama.valid.shape
     used = sorted(panorama.homographies)

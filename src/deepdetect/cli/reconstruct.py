@@ -109,7 +109,7 @@ def reconstruct(
     if folders and len(images) > 1:
         raise OptionError("give either one folder or only image files")
     if len(images) == 1 and not folders:
-        load_image(images[0])  # fails for a video, with advice
+        load_image(images[0])  # raises an error with advice if it is a video
         raise OptionError("give two or more images, or a folder")
     if len(images) > 2 or folders:
         folder = output / "model" if output == Path("deepdetect-output") else output

@@ -1,4 +1,4 @@
-"""Files in folders of images that are no further images: masks, and unknown suffixes."""
+"""Files in image folders that are left out: masks, and images with unknown suffixes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from .image_file import FORMATS, identify, open_image
 
 MASK_WORD = re.compile(r"^masks?([ ._-]+|$)|[ ._-]+masks?(?=[ ._-]|$)", re.IGNORECASE)
-"""This word is what distinguishes the name of a mask, or of a folder of masks."""
+"""This pattern finds the word "mask" in the name of a mask, or of a folder of masks."""
 
 
 def holds_image(path: Path) -> bool:
@@ -22,11 +22,11 @@ def holds_image(path: Path) -> bool:
 
 
 def without_masks(paths: Iterable[Path]) -> list[Path]:
-    """Return the image files without those that are masks of others; warn about these.
+    """Return the image files except masks of other images; warn about the masks.
 
     Masks of NAME.jpg are NAME_mask.png, NAME.mask.png, mask_NAME.png and NAME.jpg.png in its
-    folder, and these and NAME.png below a folder `masks`. With any other NAME, an image that is
-    named so is a mask if it has at most two grey levels.
+    folder, and files of these names and NAME.png below a folder `masks`. If there is no NAME.jpg,
+    an image with such a name is a mask if it has at most two grey levels.
     """
     paths = [*paths]
     folders = {path.parent for path in paths}
@@ -58,7 +58,7 @@ def _has_two_levels(path: Path) -> bool:
 
 
 def tell_left_out(paths: Sequence[Path], what: str) -> None:
-    """Warn that files are left out."""
+    """Warn that the files `paths` are left out; `what` says what they are, in the plural."""
     if paths:
         first = Path(*paths[0].parts[-2:])  # the same sentence for an absolute path
         text = f"{len(paths)} {what} are left out, such as {first} (rename them to use them)"

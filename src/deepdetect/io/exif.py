@@ -23,9 +23,9 @@ TRANSPOSED = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
 
 MAX_FOCAL_DIFFERENCE, MAX_ASPECT_DIFFERENCE = 0.1, 0.01
-"""The focal length computed from the sensor resolution is more precise than the 35 mm equivalent,
-but often wrong: it is used if they differ by at most the first fraction. A photograph whose aspect
-ratio differs from that of its EXIF by more than the second was cropped. Chosen by hand."""
+"""The focal length by sensor resolution is more precise than the 35 mm equivalent, but often wrong:
+it is used if the two differ by at most the fraction MAX_FOCAL_DIFFERENCE. A photograph was cropped
+if its aspect ratio and that in its EXIF differ by over MAX_ASPECT_DIFFERENCE. Chosen by hand."""
 
 ADVICE = "give `focal_px` or `calibration`"
 
@@ -81,7 +81,7 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 
 def read_tags(image: Any) -> tuple[dict[int, Any], dict[str, Any]]:
-    """Read the EXIF tags of a file or a PIL image, and Pillow's notes with its size, if any."""
+    """Return the EXIF tags of a file or PIL image, and Pillow's `info` of it with its size."""
     try:
         with open_image(image) if is_file(image) else nullcontext(image) as opened:
             exif = opened.getexif()

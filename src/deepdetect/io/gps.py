@@ -16,7 +16,7 @@ XMP_OF_DRONES = re.compile(rb"(?<!/)drone-dji:(\w+)\s*(?:=\s*[\"']([^\"']*)|>([^
 """This pattern finds XMP properties of DJI drones, which write them as attributes or elements."""
 
 ELLIPSOID, SEA_LEVEL, TAKE_OFF = "above the ellipsoid", "above sea level", "above take-off"
-"""What heights are measured from."""
+"""Names of the surfaces from which heights are measured."""
 
 MAX_GRAVITY_TILT_DEG = 120.0
 """Larger gimbal angles, in degrees, are treated as invalid. Chosen by hand."""
@@ -34,7 +34,7 @@ class GpsFix:
             forward), computed from the gimbal's angles, or None.
         reference: what `altitude` is measured from: `SEA_LEVEL`, or `ELLIPSOID` (RTK, EXIF 3.0).
         above_take_off: metres above the place where a drone took off; NaN if unknown.
-        assumed_hemisphere: whether north or east are assumed, because nothing states them.
+        assumed_hemisphere: whether north or east is assumed, because the file states neither.
     """
 
     latitude: float
@@ -67,7 +67,7 @@ def read_gps(path: Path) -> GpsFix | None:
     latitude = _degrees(tags.get(GPS.GPSLatitude), north_south == "S")
     longitude = _degrees(tags.get(GPS.GPSLongitude), east_west == "W")
     assumed = north_south not in ("N", "S") or east_west not in ("E", "W")
-    # 0 and 1 are above and below sea level, or since EXIF 3.0 the ellipsoid; then 2 and 3 are new.
+    # 0 and 1: above and below sea level, or since EXIF 3.0 the ellipsoid (2 and 3: sea level).
     reference = tags.get(GPS.GPSAltitudeRef, 0)
     reference = reference[0] if isinstance(reference, bytes) else reference
     altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if reference in (1, 3) else 1)
@@ -105,7 +105,7 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 
 def _degrees(value: Any, below: bool) -> float:
-    """Convert degrees, minutes, seconds to degrees: < 0 if `below` zero, NaN if invalid."""
+    """Convert degrees, minutes, seconds to degrees: negative if `below`, NaN if invalid."""
     degrees, minutes, seconds = [*map(_number, np.ravel(value)), 0.0, 0.0][:3]
     sum_ = degrees + minutes / 60 + (seconds if np.isfinite(seconds) else 0) / 3600
     return -sum_ if below else sum_

@@ -21,21 +21,21 @@ from ..geometry.camera import PosedView, camera_spacing
 from ..geometry.point_cloud import UNITS, PointCloud, RobustBox, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
-"""The page's field of view as the tangent of its half angle: the default, and the allowed range.
-Chosen by hand."""
+"""The page's field of view is given by the tangent of half its angle: DEFAULT_SLOPE, or a value in
+the range SLOPES. Chosen by hand."""
 
 MAX_LEVEL, MARGIN = 65535, 1.0
-"""Positions along each axis are stored as integers from 0 to the first number, in 16 bits. Points
-outside the robust box by more than the second times its size are left out, because a few distant
-ones would make the steps coarse. Chosen by hand."""
+"""Positions along each axis are stored as integers from 0 to MAX_LEVEL, in 16 bits. Points outside
+the robust box by more than MARGIN times its size are left out, because a few distant points would
+make the steps coarse. Chosen by hand."""
 
 CAMERA_SIZE = 0.35
-"""Depth of the pyramids that stand for cameras, in median distances from a camera to the nearest
-other one. Chosen by hand."""
+"""Depth of the pyramids that stand for cameras, relative to the median distance from a camera to
+the nearest other camera. Chosen by hand."""
 
 OVERVIEW_RADIANS, OVERVIEW_POINTS = (0.4, 0.5), 2000
-"""Azimuth and elevation of the first view of a page with cameras, and the approximate number of
-points to which it is fitted, for speed. Chosen by hand."""
+"""OVERVIEW_RADIANS are azimuth and elevation of the first view of a page with cameras. The view is
+fitted to about OVERVIEW_POINTS points, which saves time. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def write_html_page(
 
 
 def page_points(cloud: PointCloud) -> PagePoints:
-    """Quantise positions to 16 bits per axis, without those far outside the robust box."""
+    """Quantise positions to 16 bits per axis; leave out points far outside the robust box."""
     box = robust_box(cloud)
     # Points on a line or a plane have a flat box, so its radius sets the smallest margin.
     margin = MARGIN * np.maximum(box.high - box.low, box.radius * 1e-3)

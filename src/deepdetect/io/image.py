@@ -49,14 +49,14 @@ MINIMUM_SIDE = 16
 """Images must be at least this many pixels wide and high. Chosen by hand."""
 
 SEEN_IMAGES = 8
-"""The common range of many deep images is found from this many, because reading all would take
-twice the time. Chosen by hand."""
+"""The common value range of many 16-bit images is found from this many of them, because reading all
+images for it would double the time. Chosen by hand."""
 
 ALL_VALUES = (0, 65535)
 
 ORIENTATION_TAG = 0x0112
 GREY_PNG = 0
-"""This byte of a PNG file means that it is grey."""
+"""Colour type of a grey PNG image: the value at offset 25 of the file."""
 
 STRIP_PIXELS = 1 << 20
 """PIL images are converted in strips of this size, since copies of a large image take gigabytes."""
@@ -100,16 +100,16 @@ def load_image(
             command. One megapixel takes 3 MB, and up to 7 MB while it is read. Pillow itself reads
             WebP files of at most 178 megapixels (`PIL.Image.MAX_IMAGE_PIXELS`).
         value_range: the values of black and of white, such as (0, 4095) for a 12-bit sensor. None:
-            the values that the file states. If it states none, they are 0 and 1 for floats, and for
-            uint16 0 and the smallest of 255, 1023, 4095, 16383 and 65535 that no pixel exceeds,
-            without hot pixels (at most one in a thousand) and padding with 65535. A narrow band
+            the values that the file states. If it states none, black is 0, and white is 1 for
+            floats. For uint16, it is the smallest of 255, 1023, 4095, 16383 and 65535 that no pixel
+            exceeds, except hot pixels (up to 0.1%) and padding with 65535. A narrow band
             of uint16 values far from 0, as of a thermal camera, is spread over the grey levels,
             with a warning. Methods that take several images read them with one common range.
             Integers that are neither uint8 nor uint16 need this option.
         bands: numbers, from 1, of the three bands of a TIFF file or array that become red, green
             and blue: (4, 3, 2) for Landsat 8. None: the first three. Images of four bands without
             alpha, or of more than four bands, need this option.
-        page: number, from 0, of the image to read from a file with several; thumbnails do not
+        page: number, from 0, of the image to read if a file has several; thumbnails do not
             count. None: the largest image of a TIFF file (the first of equally large ones), and
             the first image of any other file.
         allow_truncated: read truncated files; the missing part is black or grey.
@@ -142,10 +142,10 @@ def load_image(
 def load_pixels(
     image: Any, channels: Channels = "rgb", *, deep: bool = False, raw: bool = False
 ) -> np.ndarray:
-    """Read an image like `load_image`, with a fourth channel, as in `alpha`, if it is transparent.
+    """Read an image like `load_image`; transparent pixels are marked in a fourth channel.
 
-    If `deep`, images with more than 8 bits per channel become uint16. If `raw`, arrays and files
-    keep their numbers, and arrays and TIFF files all their bands, (H, W, C).
+    If `deep`, images with more than 8 bits per channel become uint16. If `raw`, values are not
+    scaled, and arrays and TIFF files keep all their bands, (H, W, C).
     """
     return _load(image, channels, reading_options(), deep=deep, raw=raw)
 
@@ -153,7 +153,7 @@ def load_pixels(
 def load_visible(
     image: Any, channels: Channels = "rgb", ignore: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read an image like `load_image`; return it, and the mask `ignore` with transparent pixels."""
+    """Read an image like `load_image`; return it, and a mask of ignored and transparent pixels."""
     rgb, hidden = opaque_part(load_pixels(image, channels))
     if hidden is None or ignore is None:
         return rgb, ignore if hidden is None else hidden
@@ -163,7 +163,7 @@ def load_visible(
 def load_pair(
     images: tuple[Any, Any], channels: Channels, ignore: Any = None
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray | None, np.ndarray | None]]:
-    """Load two images with one range; return both images, and both masks of `load_visible`."""
+    """Load two images with one value range; return the images, and the masks of `load_visible`."""
     masks = ignore_masks(ignore, 2)
     with one_range(images, channels):
         first, mask0 = load_visible(images[0], channels, masks[0])
@@ -173,11 +173,11 @@ def load_pair(
 
 @contextmanager
 def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOptions]:
-    """Read the uint16 images of a call with one range in the block; yield the options of reading.
+    """Read all uint16 images in the block with one value range; yield the reading options.
 
-    All functions that read several images, also by way of others, do so in this block. The range is
-    that of all images together, or of `SEEN_IMAGES` of a longer list at equal steps, if the first
-    that may be of this kind is. Open files and pipes, which may be readable once, are not seen.
+    Every function that reads several images does so in such a block. The range is found from all
+    `images` that may have 16 bits, or from `SEEN_IMAGES` at equal steps, unless the first of them
+    does not need it. Open files and pipes are skipped: they may be readable only once.
     """
     options, counts = reading_options(), np.zeros(1 << 16, np.int64)
     seen = [each for each in images if _may_be_deep(each)] if options.deep_range is None else []
@@ -194,7 +194,7 @@ def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOption
 
 
 def _may_be_deep(image: Any) -> bool:
-    """Return whether an image may have 16 bits per channel, by the first bytes of a file."""
+    """Return whether an image may have 16 bits per channel, by its type or its first bytes."""
     if is_path(image) and Path(image).is_file():
         with suppress(OSError), open(image, "rb") as file:
             image = file.read(SIGNATURE_BYTES)
@@ -273,7 +273,7 @@ def image_named(number: int) -> Iterator[None]:
 
 
 def at_pixels(mask: np.ndarray | None, xy: np.ndarray) -> np.ndarray:
-    """Return, (N,) bool, at which of (N, 2) positions a mask of `load_visible` is true."""
+    """Return (N,) bool: whether a mask of `load_visible` is true at each of (N, 2) positions."""
     if mask is None:
         return np.zeros(len(xy), bool)
     columns, rows = np.rint(xy).clip(0, np.subtract(np.shape(mask)[::-1], 1)).astype(np.intp).T
@@ -297,8 +297,8 @@ def luma(rgb: np.ndarray) -> np.ndarray:
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """List the image files below a folder in natural order: "2.png" comes before "10.png".
 
-    Images that commands of this package have written into the folder are left out. With a warning,
-    so are masks of other images, and images with other suffixes than `IMAGE_SUFFIXES`.
+    Images that commands of this package have written into the folder are left out. Masks of other
+    images, and images with suffixes not in `IMAGE_SUFFIXES`, are left out with a warning.
 
     Raises:
         ImageError: the folder is missing, is a file, or has no image outside of `exclude`.
@@ -307,7 +307,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
 
     root = Path(folder)
     if root.is_file():
-        load_image(root)  # fails for a video, with advice
+        load_image(root)  # raises an error with advice if it is a video
         raise ImageError(f"{root} is a file: name the folder that it is in")
     if not root.is_dir():
         raise MissingImageError(f"there is no folder {root}: check the path")
@@ -369,7 +369,7 @@ def _read_file(
                 orientation, several = orientation_of(image), hasattr(image, "n_frames")
             del image  # frees its pixels before `UPRIGHT` makes another copy
         pages: list[int] = []
-        with suppress(Exception):  # a file may be damaged behind its first image
+        with suppress(Exception):  # a file may be damaged after its first image
             pages = page_numbers(file) if several and options.page is None else []
     if len(pages) > 1:
         text = f"{name} holds {len(pages)} images, of which one is taken: choose it by `page`"
@@ -380,7 +380,7 @@ def _read_file(
 
 
 def _behind_mask(rgb: np.ndarray, name: str) -> np.ndarray:
-    """Make the pixels transparent that are 0 in NAME.msk, GDAL's mask beside an image file."""
+    """Make pixels transparent where NAME.msk, GDAL's mask next to an image file, is 0."""
     with open_image(f"{name}.msk", what="mask") as mask:
         shown = np.asarray(mask) != 0
     shown = shown.reshape(*shown.shape[:2], -1).any(axis=2)

@@ -52,7 +52,7 @@ FORMATS = {
     "JXL": ".jxl",  # likewise
     "TGA": ".tga",  # has no signature, so it comes last
 }
-"""Formats that are read, with their suffixes. EPS is not, because it would start Ghostscript."""
+"""Formats that are read, with their suffixes. EPS is not read, since it would start Ghostscript."""
 
 _RAW = ".dng .cr2 .cr3 .crw .nef .nrw .arw .sr2 .srf .raf .orf .rw2 .pef .srw .3fr .iiq .erf"
 RAW_SUFFIXES = tuple(f"{_RAW} .mrw .kdc .dcr .mos .mef .x3f .rwl".split())
@@ -65,7 +65,7 @@ UNREAD = {
     b"\x93NUMPY": ("a NumPy array", ""),
     b"DICM": ("a DICOM image", ".dcm"),
 }
-"""Signatures, names and suffixes of formats that are rejected: their value range is undefined."""
+"""Signatures, names and suffixes of formats rejected because their value range is undefined."""
 
 _OTHERS = (suffixes for _, suffixes in UNREAD.values())
 IMAGE_SUFFIXES = (*" ".join([*FORMATS.values(), *_OTHERS]).split(), *RAW_SUFFIXES)
@@ -75,8 +75,8 @@ MAX_MEGAPIXELS = 200.0
 """Images with more megapixels are rejected by default. The largest phone sensors have 200."""
 
 SIGNATURE_BYTES = 262
-"""Formats are recognised by this many first bytes: those of DICOM are bytes 128 to 131, those of an
-MPEG transport stream in its first two packets, and those of tar from byte 257 on."""
+"""Formats are recognised by this many first bytes. The signature of DICOM is at bytes 128 to 131,
+that of tar starts at byte 257, and that of an MPEG transport stream is in its first two packets."""
 
 STANDARD_INPUT = "/dev/stdin"
 """This path means standard input on every system. For commands, "-" does so as well."""
@@ -87,8 +87,8 @@ PLUGINS = {
     "pillow-heif": (rb"(?s).{4}ftyp(hei[cxms]|mif1|msf1)", "pillow_heif.HeifImagePlugin", "HEIF"),
     "pillow-jxl-plugin": (rb"\xff\n|\0{3}\x0cJXL ", "pillow_jxl", "JPEG XL"),
 }
-"""Plug-ins of Pillow: first bytes of their format (ISO/IEC 23008-12, 18181-2), the module that
-registers it at its import, and its name."""
+"""Plug-ins of Pillow: first bytes of the plug-in's format (ISO/IEC 23008-12, 18181-2), the module
+whose import registers this format, and the format's name."""
 
 VIDEO = (
     rb"(?s)\x1aE\xdf\xa3|.{8}AVI |0&\xb2u|FLV|OggS|\0\0\x01[\xb3\xba]|\0\0\0\x01|\x06\x0e\+4"
@@ -103,11 +103,11 @@ OTHERS = {
     ),
     rb"%PDF": 'a PDF file: draw its pages, as pdftoppm -r 200 -png "{0}" page does, and give these',
     rb"(?!#EXTM3U)[^\0-\x08\x0e-\x1a\x1c-\x1f]{4,}\Z": (
-        "text, no image or video: give such files, or their folder"
+        "text, not an image or video: give such files, or their folder"
     ),
 }
-"""First bytes of files that people give for images or videos, what these are, and what to do. A
-playlist of a video is text that OpenCV reads."""
+"""First bytes of files that are neither images nor videos, what such a file is, and what to do.
+Playlists of videos, which are text that begins with #EXTM3U, are excepted: OpenCV reads them."""
 
 
 @suggest_keywords
@@ -115,8 +115,8 @@ playlist of a video is text that OpenCV reads."""
 class ReadingOptions:
     """How image files are read; the fields other than the last two are parameters of `load_image`.
 
-    `deep_range` is the range of uint16 images that state none, common to the images of a call.
-    While it is looked for, the values of these images are added up in `counts`.
+    `deep_range` is the common value range of those uint16 images of a call whose files state none.
+    While this range is being found, the histograms of these images are summed in `counts`.
     """
 
     max_megapixels: float = MAX_MEGAPIXELS
@@ -194,8 +194,8 @@ def open_image(
     """Open an image file as a PIL image; its pixels are decoded when it is loaded.
 
     The source is a path, the content of a file as bytes, or a binary file, which is read from its
-    beginning and stays open. Errors of Pillow in the block become those below. Messages call an
-    image without a path "the", followed by `what`.
+    beginning and stays open. Pillow's errors in the block are raised as the errors below. In
+    messages, an image without a path is called "the" and `what`, such as "the mask".
 
     Raises:
         ImageError: the file is missing, truncated, damaged (where the format allows to detect it),
@@ -337,7 +337,7 @@ def _check_png(file: BinaryIO, name: str) -> None:
 
 
 def identify(file: BinaryIO, name: str, formats: Iterable[str] = FORMATS) -> Any:
-    """Open a file with the first of the formats, which are keys of `FORMATS`, that accepts it.
+    """Open a file with the first of `formats` (keys of `FORMATS`) whose reader accepts it.
 
     `PIL.Image.open` is not used, because its size limit can only be set for the whole program.
     """

@@ -32,12 +32,12 @@ PIXEL_SCALE, TRANSFORMATION = 33550, 34264
 
 PLACES = re.compile(rb"<GeoTransform>|<GeodataXform|<GCPList|gml\.data|\xb1\x4b\xf8\xbd\x08\x3d")
 MAX_HEADER_BYTES = 1 << 20
-"""Marks of places in .aux.xml and at the start of JPEG 2000 files, and the bytes to search."""
+"""PLACES finds a georeference in the first MAX_HEADER_BYTES of .aux.xml and JPEG 2000 files."""
 
-NO_MATRIX = "the place of an image is not kept, since no affine matrix that GDAL reads states it: \
-warp an image with ground control points or RPCs by gdalwarp first"
-NO_SYSTEM = "a GeoTIFF without a coordinate system keeps its place as that of a local grid: assign \
-the system by gdal_edit.py -a_srs if you know it"
+NO_MATRIX = "the place (georeference) of an image is not kept, since GDAL reads no affine matrix \
+from it: warp an image with ground control points or RPCs by gdalwarp first"
+NO_SYSTEM = "a GeoTIFF without a coordinate system is treated as a local grid: assign the system \
+by gdal_edit.py -a_srs if you know it"
 
 FIRST_CENTRE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 """This matrix maps the package's pixel coordinates, whose origin is the centre of the first pixel,
@@ -65,8 +65,8 @@ EXIF_DIRECTORIES = (IFD.Exif, IFD.GPSInfo)
 """EXIF tags and directories that are kept, since they do not depend on how pixels are stored."""
 
 LAYOUT = re.compile(r"\s*[{<]|ImageJ=|SCANIMAGE|Aperio")
-"""Descriptions in TIFF files that begin so state the layout of their pages: those of tifffile, OME,
-ImageJ, ScanImage and Aperio. They would be wrong for another image."""
+"""TIFF descriptions that begin like this (by tifffile, OME, ImageJ, ScanImage or Aperio) state the
+layout of the pages of their file. They would be wrong for another image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,8 @@ class Metadata:
     """What an image file contains in addition to its pixels.
 
     Attributes:
-        to_world: (3, 3) matrix from pixels, where (0, 0) is the centre of the first one, to world
-            coordinates; None without a georeference.
+        to_world: (3, 3) matrix from pixel coordinates, where (0, 0) is the centre of the first
+            pixel, to world coordinates; None without a georeference.
         crs: coordinate reference system of the world as an object of rasterio; None: a local grid.
         no_data: value that means "no data" according to GDAL's tag, or None.
         profile: the ICC profile, or None.
@@ -98,9 +98,9 @@ class Metadata:
         return self.bands in (1, 3, 4) and np.dtype(self.dtype) in (np.uint8, np.uint16, np.bool_)
 
     def raster(self, rgb: np.ndarray, value_range: ValueRange) -> np.ndarray:
-        """Return uint16 RGB with the type and the numbers of this image, grey if it is grey.
+        """Convert uint16 RGB to the data type and values of this image, and to grey if it is grey.
 
-        The range are the numbers that 0 and 65535 stand for, unless the image is uint16 itself.
+        `value_range` are the values for which 0 and 65535 stand, unless this image is uint16.
         """
         if self.bands == 1 and (rgb == rgb[:, :, :1]).all():
             rgb = rgb[:, :, 0]
@@ -110,7 +110,7 @@ class Metadata:
         return (numbers if self.dtype.kind == "f" else np.rint(numbers)).astype(self.dtype)
 
     def with_no_data(self, image: np.ndarray, absent: np.ndarray) -> tuple[np.ndarray, Metadata]:
-        """Give absent pixels the value that means "no data", if the image's type has that value."""
+        """Set absent pixels to the value that means "no data", if the data type can hold it."""
         value, whole = self.no_data, np.iinfo(image.dtype) if image.dtype.kind in "iu" else None
         if value is None or not (whole is None or whole.min <= value <= whole.max):
             return image, replace(self, no_data=None)
@@ -214,7 +214,7 @@ class Metadata:
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
-    """Return whether there are EXIF values, all of which Pillow can write; it only reads some."""
+    """Return whether there are EXIF values, and Pillow can write all (some it can only read)."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     directory = ImageFileDirectory_v2()
@@ -360,7 +360,7 @@ def save_picture(
 ) -> None:
     """Write (H, W, 3) uint8 or uint16 RGB with its metadata as .png, .tif or .jpg, atomically.
 
-    JPEG files get 8 bits; the range are the values of black and white of uint16 pixels.
+    JPEG files get 8 bits, for which uint16 pixels are scaled by `value_range` (black and white).
     """
     suffix = picture_suffix(path)
     if suffix.startswith(".tif"):

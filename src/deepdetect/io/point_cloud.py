@@ -23,7 +23,7 @@ def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
 
     If the cloud has normals, they are written between position and colour as float nx ny nz, which
     makes 27 bytes per point. Frame, unit and metadata become comments, with "?" for each character
-    outside ASCII. PLY libraries do not write comments, so none is used.
+    outside ASCII. No PLY library is used, because none writes comments.
     """
     columns = {"x y z": cloud.points, "nx ny nz": cloud.normals}
     vectors = {names: values for names, values in columns.items() if values is not None}

@@ -15,21 +15,21 @@ from .image import luma
 from .image_file import RAW_SUFFIXES, file_name, is_path
 
 MIN_ASPECT, MAX_ASPECT = 1.95, 2.05
-"""A panorama of 360 degrees is at least MIN_ASPECT times as wide as high. Up to MAX_ASPECT it is a
-sphere (2, up to resizing), otherwise it may be a cylinder."""
+"""A panorama of 360 degrees is at least MIN_ASPECT times as wide as high. Up to MAX_ASPECT, it is
+equirectangular (2:1, with a margin for resizing); a wider one may be cylindrical."""
 
 ROWS, SHARPEST, FAR, MARGIN = 512, 0.003, (1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2), 1.5
-"""Edges meet if they differ MARGIN times less than any two columns at the distances FAR (of the
-width), and no more than neighbours without the SHARPEST part, which are outlines of things. A plain
-background is mostly wider than 1/16, so that far columns are alike. Some ROWS are compared, which
-takes less time. The ratio is at least 1.5 for 6 panoramas, and at most 1.4 for 2,163 photographs
-cut to 2:1."""
+"""Left and right edges meet if they differ MARGIN times less than any two columns at the distances
+FAR (fractions of the width), and no more than neighbouring columns, except the fraction SHARPEST of
+these (outlines). FAR begins with 1/16, because most plain backgrounds, whose columns are all alike,
+are wider. About ROWS rows are compared, to save time. The ratio that MARGIN limits is at least 1.5
+for 6 panoramas, and at most 1.4 for 2,163 photographs cut to 2:1."""
 
 SIDE_PX, BLACK, MAX_DARK, ROUNDNESS, MAX_CUT = 128, 16, 48, (0.97, 0.92), 16 / 9
-"""An image is reduced to the shorter side SIDE_PX. If it is round, its corners have up to MAX_DARK
-grey levels (the noise of cheap cameras), it is brighter by over BLACK (ITU-R BT.601), and fills the
-first part ROUNDNESS of a circle (an octagon fills 0.90), or the second if two are side by side. The
-diameter is from the shorter side to MAX_CUT times that (a video of full width). Chosen by hand."""
+"""Fisheye circles are sought in images reduced to a shorter side of SIDE_PX. The corners have
+up to MAX_DARK grey levels (noise of cheap cameras), the circle over BLACK more (ITU-R BT.601). It
+fills ROUNDNESS[0] of a disc (an octagon fills 0.90), or ROUNDNESS[1] if two are side by side. Its
+diameter is 1 to MAX_CUT times the shorter side (a video of full width). Chosen by hand."""
 
 VIEWS = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90 view.png"
 
@@ -39,9 +39,9 @@ def require_pinhole(
 ) -> None:
     """Raise an ImageError if an image is a panorama or a fisheye picture.
 
-    `rgb` (H, W, 3) are its pixels; without them, only its metadata count. With `rim`, a round
-    picture on black is that of a fisheye. A plane seen through an eyepiece looks the same. An image
-    that is no file has the `name` in the message.
+    `rgb` (H, W, 3) are its pixels; if None, only its metadata are examined. If `rim`, a round
+    picture on black counts as a fisheye picture, although a plane seen through an eyepiece looks
+    the same. The message calls an image that is not a file `name`.
     """
     raw = file_name(image).lower().endswith(RAW_SUFFIXES)
     tags, notes = ({}, {}) if raw else read_tags(image)
@@ -101,9 +101,9 @@ def is_cube_map(gray: np.ndarray) -> bool:
 
 
 def is_round(gray: np.ndarray, beside: int = 0) -> bool:
-    """Return whether an (H, W) image is dark outside a circle, which two edges may cut.
+    """Return whether an (H, W) image is dark outside a circle, which two image edges may cut.
 
-    With `beside` 1, there is another circle beside it, which may reach into the image.
+    If `beside` is 1, the image is half of a picture of two circles: the other may reach into it.
     """
     scale = SIDE_PX / min(gray.shape)
     small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -18,7 +18,7 @@ from ..features.keypoints import Keypoints
 from ..features.matches import Evidence, Layer, Matches, TwoViewGeometry
 
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
-"""These attributes of keypoints may be None. An npz file contains those that are not."""
+"""These attributes of keypoints may be None. An npz file contains those that are not None."""
 
 MATCH_VALUES = (
     *("points0", "points1", "scores", "inliers", "subpixel", "indices0", "indices1", "layer"),

@@ -31,9 +31,9 @@ JPEG = (6, 7)
 """Codes of JPEG compression, the only compression with which YCbCr is read."""
 
 ALPHA = (1, 2)
-"""Types of extra samples that are alpha and not a band; the first has multiplied the colours."""
+"""Types of extra samples that are alpha, not a band; with type 1, it has multiplied the colours."""
 ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
-"""Codes of tags; GDAL defines the last one."""
+"""Codes of TIFF tags. NO_DATA is defined by GDAL."""
 
 MAX_BYTES_PER_PIXEL = 256
 """Files with more bytes per pixel are rejected, since small files can claim any number of bands."""
@@ -105,14 +105,14 @@ def chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
 
 
 def whole_pages(stored: list[Any]) -> list[Any]:
-    """Return the pages, or else those below them, that are neither thumbnails nor masks."""
+    """Return the pages, or else their subpages, that are neither thumbnails nor masks."""
     pages = [page for page in stored if not (page.is_reduced or page.is_mask)]
     below = [each for page in stored for each in page.pages or ()] if not pages else []
     return pages or [each for each in below if not (each.is_reduced or each.is_mask)] or stored[:1]
 
 
 def _mask_of(stored: list[Any], page: Any) -> np.ndarray | None:
-    """Return GDAL's mask of a page, (H, W) bool: it follows the page, as its thumbnails do."""
+    """Return GDAL's mask of a page, (H, W) bool, if one is stored after the page; else None."""
     after = stored[stored.index(page) + 1 :] if page in stored else []
     others = takewhile(lambda each: each.is_mask or each.is_reduced, after)
     size = page.imagewidth, page.imagelength
@@ -229,7 +229,7 @@ def _white(page: Any) -> int | None:
 
 
 def _decoded_by_pillow(file: BinaryIO, stored: list[Any], page: Any, name: str) -> np.ndarray:
-    """Decode with Pillow, if it does so correctly, a page for which tifffile needs imagecodecs.
+    """Decode a page by Pillow if Pillow does so correctly and tifffile would need imagecodecs.
 
     Returns:
         (H, W, bands) as they are stored, but turned upright.

@@ -10,8 +10,8 @@ import numpy as np
 from .._shared.opencv import cv2
 
 MAX_CIRCLES, LEAST_RADIUS_PX = 5000, 2.0
-"""More keypoints than this are drawn as single pixels, because circles would cover the image. The
-second number is the minimum radius of a circle; keypoints without a size get one pixel more."""
+"""More than MAX_CIRCLES keypoints are drawn as single pixels, since circles would cover the image.
+A circle has at least the radius LEAST_RADIUS_PX, or 1 pixel more if its keypoint has no size."""
 
 PICTURE_SIDE_PX = 2000
 """Longest side of a visualisation, in pixels. A JPEG of it then takes less than two megabytes."""
@@ -212,7 +212,7 @@ def add_scale(
 
 
 def _caption(text: str, width: int, unit: float) -> np.ndarray:
-    """Return a black strip with one line of text, shrunk to fit; `line_scale` gives `unit`."""
+    """Return a black strip with one line of text, shrunk to fit; `unit` comes from `line_scale`."""
     strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
     room = width - round(2 * CAPTION_MARGIN * unit)
     if room <= 0:
