@@ -237,7 +237,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
     in_bands = list(bands(ranking.shape))
-    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # computed once
+    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # a single band is computed once
     lowest = np.float32(-np.inf)
     if count is not None:
         parts = (ranks[wanted(rows) if only is None else only] for rows in in_bands)
@@ -345,7 +345,7 @@ def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def without_frame(rgb: np.ndarray, ignore: np.ndarray | None) -> np.ndarray | None:
-    """Return the ignore mask of a (H, W, 3) image with its uniform frame, if it has one."""
+    """Add the uniform frame of a (H, W, 3) image, if it has one, to the image's ignore mask."""
     frame = uniform_frame(rgb)
     return ignore if not frame.any() else frame if ignore is None else frame | ignore
 
@@ -386,7 +386,7 @@ def descending_order(values: np.ndarray) -> np.ndarray:
     """
     if values.dtype != np.float32:
         return np.argsort(-values, kind="stable")
-    # Read as integers, the bits of floats have the order of their magnitudes.
+    # The bits of floats, read as integers, have the same order as the floats' magnitudes.
     bits = (values + np.float32(0)).view(np.int32)
     keys = np.where(bits < 0, bits & 0x7FFFFFFF, ~bits).astype(np.int64) << 32
     keys |= np.arange(len(values))

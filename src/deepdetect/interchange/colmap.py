@@ -39,7 +39,7 @@ def write_colmap(
     Args:
         collection: the images.
         output: path that ends in .db.
-        intrinsics: camera of each image, by name. Images with the same object share a camera.
+        intrinsics: camera of each image, by image name. Images with the same object share a camera.
         verify: estimate the two-view geometry of each pair, which COLMAP's mapper needs.
 
     Returns:

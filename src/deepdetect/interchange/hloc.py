@@ -25,7 +25,7 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
     at all. The descriptors of an image have the shape (D, N).
 
     Args:
-        collection: the images; hloc needs descriptors for matching, not for mapping.
+        collection: the images, whose descriptors hloc needs for matching, but not for mapping.
         output: folder for the files.
 
     Returns:
