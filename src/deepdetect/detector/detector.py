@@ -63,7 +63,7 @@ class DeepDetect:
     """The dense keypoint detector of the paper.
 
     Its keypoints are the pixels to which the network gives a high probability. If you need only a
-    few thousand keypoints, use `PointDetector`: it finds better ones than the most probable pixels.
+    few thousand keypoints, use `PointDetector`: its keypoints work better than as many pixels.
 
     Args:
         weights: name of bundled weights ("default", "dense", "free" or "espnet"), or an ONNX file.

@@ -263,7 +263,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Improve the two best matches of each query in the bands `first` to `last` (exclusive).
 
-    `bands` holds the number of the first query in each band; queries are in row-major order. `at0`
+    `bands` holds the index of the first query in each band; queries are in row-major order. `at0`
     and `at1` hold the row of the keypoint at each pixel of the two images, or -1. `turn` is the
     number of the sweep: even sweeps go down the image, odd ones up. Two kinds of candidates are
     tried for a query: the matches of the queries at `offsets` from it, shifted by the offset, and

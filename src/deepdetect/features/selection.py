@@ -397,7 +397,7 @@ def descending_order(values: np.ndarray) -> np.ndarray:
 def suppress_neighbors(
     xy: np.ndarray, scores: np.ndarray, radius_px: float | np.ndarray, max_count: int | None = None
 ) -> np.ndarray:
-    """Keep each point, from the best on, unless it is near a kept one; return the kept rows.
+    """Keep the points, best first, that are not near a better kept point; return the kept rows.
 
     The rows are ordered best first; among equal scores, the lower row counts as better. Two points
     are near if their distance is below the radius or, with (N,) radii, below the smaller of their

@@ -176,7 +176,7 @@ def baseline_in(values: Values, pair: bool) -> float | None:
 
 
 def check_pinhole(values: Values) -> None:
-    """Raise an error if one of the values says that the camera is no pinhole without distortion."""
+    """Raise an error if a value says that the camera has distortion or is not a pinhole."""
     for key, value in values.items():
         name = short(key)
         words = value.replace("_", " ") if isinstance(value, str) else ""
@@ -209,7 +209,7 @@ def _pair_at(values: Values, choices: Iterable[tuple[str, ...]]) -> list[float]:
     for names in choices:
         if numbers := [n for name in names for n in numbers_in(values.get(name))]:
             if len(numbers) < len(names):
-                raise ReconstructionError(f"it lacks {names[0]} or {names[1]}: add the other")
+                raise ReconstructionError(f"it lacks {names[0]} or {names[1]}: add the missing one")
             return (numbers * 2)[:2]
     return []
 
@@ -335,7 +335,7 @@ def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
         different = {repr(view): view for view in fitting}
         if len(different) > 1:
             raise ReconstructionError(
-                f"it has {len(different)} different cameras: give a file with that of these images"
+                f"it has {len(different)} different cameras: give a file with the one of the images"
             )
         left, right, length = fitting[0], fitting[0], None
     values = {"left": left, "right": right, "baseline_mm": length}
@@ -379,8 +379,8 @@ def kitti(values: Values, image: Pair) -> Values | None:
     first, second = next(pairs, (only, only))
     if wanted and wanted != (first, second):
         warnings.warn(
-            f"the calibration lacks the cameras {wanted[0]} and {wanted[1]} or one of them, which "
-            f"the images are from: its cameras {first} and {second} are taken instead",
+            f"the calibration lacks camera {wanted[0]} or {wanted[1]}, which took the images: its "
+            f"cameras {first} and {second} are used instead",
             stacklevel=2,
         )
     size = {"resolution": values.get(f"S_rect_0{first}")}

@@ -362,7 +362,7 @@ class Parallax:
         return self.log10_nfa < MAX_LOG10_NFA
 
     def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether `significant`, and `agreeing` is at least this fraction of `on_plane`."""
+        """Whether it is `significant`, and `agreeing` is at least this fraction of `on_plane`."""
         return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property

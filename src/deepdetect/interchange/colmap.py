@@ -34,7 +34,7 @@ def write_colmap(
     intrinsics: Mapping[str, CameraIntrinsics],
     verify: bool = True,
 ) -> tuple[Path, ...]:
-    """Write a COLMAP database, complete or not at all; an existing file is replaced.
+    """Write a COLMAP database atomically; an existing file is replaced.
 
     Args:
         collection: the images.

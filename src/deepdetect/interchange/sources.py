@@ -155,8 +155,8 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
             before = keypoints.setdefault(name, own)
             if not (np.array_equal(before.xy, own.xy) and before.image_size == own.image_size):
                 raise InvalidFileError(
-                    f"{path} has other keypoints of {name} than the other files: write all with "
-                    "the same options"
+                    f"{path} has other keypoints of {name} than the other files: write all "
+                    "files with the same options"
                 )
         kept = loaded.inliers
         rows = np.column_stack([loaded.indices0[kept], loaded.indices1[kept]])

@@ -10,7 +10,7 @@ from ..._shared.opencv import cv2
 from ...features.selection import descending_order, peak_offset
 
 NMS_RADIUS = 2
-"""A candidate is the maximum of its level within this many pixels in x and y. Chosen by hand."""
+"""A candidate has the highest |det Hessian| within this many pixels in x and y. Chosen by hand."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
 """Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Seven levels have
