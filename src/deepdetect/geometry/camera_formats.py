@@ -379,8 +379,8 @@ def kitti(values: Values, image: Pair) -> Values | None:
     first, second = next(pairs, (only, only))
     if wanted and wanted != (first, second):
         warnings.warn(
-            f"the calibration lacks camera {wanted[0]} or {wanted[1]}, which took the images: its "
-            f"cameras {first} and {second} are used instead",
+            f"the images are of the cameras {wanted[0]} and {wanted[1]}, but the calibration lacks "
+            f"one or both: its cameras {first} and {second} are used instead",
             stacklevel=2,
         )
     size = {"resolution": values.get(f"S_rect_0{first}")}
