@@ -93,7 +93,7 @@ def _search_both_ways(
     else:
         queries, base = (np.asarray(part, np.float32) for part in (queries, base))
         session, factor = session_of(PRODUCTS / "float.onnx"), np.ascontiguousarray(base.T)
-    found = min(count + 1, len(base))  # one more, to detect ties within rounding errors
+    found = min(count + 1, len(base))  # one more row, to detect ties within rounding errors
     rows = np.empty((len(queries), found), np.int32)
     squared = np.empty((len(queries), found), np.float32)
     nearest = np.zeros(len(base), np.int32)

@@ -246,7 +246,7 @@ class Matches:
                 f"matches need equally many points0, points1, scores and inliers, not {counts}"
             )
         if not (np.isfinite(self.points0).all() and np.isfinite(self.points1).all()):
-            raise OptionError("matches need finite positions: leave out those that are not finite")
+            raise OptionError("matches need finite positions: leave out the other matches")
         for side in (0, 1):
             name = f"indices{side}"
             indices = getattr(self, name)

@@ -202,7 +202,7 @@ def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -
     """Return a bit mask, packed along the rows, of pixels above the threshold and not ignored."""
     if ignore is not None:
         ignore = check_ignore(ignore, maps.shape)
-    # A density may need all pixels except those with a probability of 0.
+    # With a density, all pixels with a probability above 0 may become keypoints.
     threshold = options.threshold if options.density is None else 0.0
     packed, heatmap = [], maps.heatmap()
     for rows in bands(maps.shape):

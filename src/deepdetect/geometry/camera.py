@@ -370,7 +370,7 @@ class PosedView:
 
 def camera_spacing(centres: np.ndarray) -> float:
     """Return the median distance from a camera to its nearest neighbour; `centres` is (V, 3)."""
-    blocks = np.array_split(centres, len(centres) // 500 + 1)  # blocks limit the memory
+    blocks = np.array_split(centres, len(centres) // 500 + 1)  # blocks limit the use of memory
     distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
     second = min(1, len(centres) - 1)  # index 0 is the camera itself
     nearest = [np.partition(each, second, axis=1)[:, second] for each in distances]

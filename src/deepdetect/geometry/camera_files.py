@@ -143,7 +143,7 @@ def _text(lines: str) -> Values:
             key, value = key.strip(), (value or "").strip()
             if start or (sign and value and name and name not in section):
                 section = values.setdefault(key if start else name, {})
-            if sign and value and key in section:  # the next of several cameras
+            if sign and value and key in section:  # a repeated key starts the next camera
                 section = values.setdefault(f"{len(values)}", {})
             if sign and value:
                 section[key] = numbers_in(value) or value

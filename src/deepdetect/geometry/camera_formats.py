@@ -115,7 +115,7 @@ def numbers_in(value: Any) -> list[float]:
 
 
 def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
-    """Return a matrix with one of these numbers of elements as three rows; otherwise None."""
+    """Return a matrix whose number of elements is in `sizes`, as three rows; otherwise None."""
     nested = value[0] if isinstance(value, list) and value else value
     if isinstance(nested, Mapping) and "data" not in nested:
         return None
@@ -478,7 +478,7 @@ def meshroom(values: Values, image: Pair) -> Any:
 def metashape(values: Values, image: Pair) -> Any:
     """Read Metashape's calibration, or the cameras of a chunk; adjusted ones are preferred.
 
-    Before version 1.2, PhotoScan had fx and fy, and counted cx and cy from the corner.
+    Before version 1.2, PhotoScan had fx and fy, and measured cx and cy from the corner.
     """
     cameras = []
     for _, each in objects_in(values):

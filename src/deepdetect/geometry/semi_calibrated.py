@@ -38,7 +38,7 @@ FOCAL_SPREAD, FOCAL_DIFFERENCE, PRINCIPAL_POINT_SPREAD = 0.7, 0.03, 0.03
 0, of the difference of both log focal lengths, and of cx and cy from the middle. Chosen by hand."""
 
 MATCH_SIGMA_PX = 0.5
-"""Standard deviation of correct matches from their epipolar lines. Chosen by hand."""
+"""Standard deviation of the distance of correct matches to epipolar lines. Chosen by hand."""
 
 MIN_SIGMA_PX = 0.1
 """Minimum standard deviation of match errors in `refine_fundamental`. Chosen by hand."""
