@@ -63,7 +63,7 @@ class DeepDetect:
     """The dense keypoint detector of the paper.
 
     Its keypoints are the pixels to which the network gives a high probability. If you need only a
-    few thousand keypoints, use `PointDetector`: it finds better ones than the most probable pixels.
+    few thousand keypoints, use `PointDetector`: its keypoints work better than as many pixels.
 
     Args:
         weights: name of bundled weights ("default", "dense", "free" or "espnet"), or an ONNX file.
@@ -360,8 +360,8 @@ def find_keypoints(
 ) -> Keypoints:
     """Find the keypoints of a (H, W, 3) or (H, W, 4) uint8 image with any detector.
 
-    A detector is any object with a method `detect` or `heatmap` like those of this package. If
-    the detector has heat maps, `selection` chooses their pixels; None: pixels above 0.5.
+    A detector is any object with a method `detect` or `heatmap` like those of this package. If the
+    detector has heat maps, `selection` tells which pixels become keypoints (None: above 0.5).
     """
     check_selection(detector, selection)
     rgb, ignore = load_visible(rgb, ignore=ignore)

@@ -22,7 +22,7 @@ from .pretrained import STRIDE
 from .tiling import BYTES_PER_PIXEL, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
-"""The resolution "auto" scales larger images down to this: finer pixels mostly show noise."""
+"""The resolution "auto" scales larger images down to this area: finer pixels mostly show noise."""
 
 RELEASE_PIXELS = 20_000_000
 """If an image with more pixels than this was scaled down for the network, the memory that the
@@ -116,7 +116,7 @@ def compute_maps(
 
 @contextmanager
 def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
-    """Turn errors for lack of memory in the block into errors that name the size of the image."""
+    """Convert out-of-memory errors in the block to an error that names the size of the image."""
     try:
         yield
     except Exception as error:

@@ -46,21 +46,20 @@ class PointDetector:
         max_keypoints: maximum number of keypoints per image. None: all.
         spread: how keypoints are chosen if there are more than `max_keypoints`. "none" takes those
             ranked highest. "grid" takes the best of each cell of a grid, then the second-best of
-            each, and so on. "anms" takes good ones that lie as far apart as their number allows.
+            each, and so on. "anms" takes good keypoints that are as far apart as possible.
         upright: give all keypoints the angle 0, which keeps more matches of images that are not
-            rotated relative to each other. It is for programs that compare descriptors as they are,
-            such as `cv2.BFMatcher`; `match_features` does about as well without it.
+            rotated relative to each other. Use this for programs that compare descriptors as they
+            are, such as `cv2.BFMatcher`; `match_features` does about as well without it.
         resolution: "auto" (images over two megapixels are scaled down to that) or "native" (images
             keep their size).
         ranker: npz file of the network that ranks the keypoints, written by `deepdetect dev
             train-points`. None: the bundled file.
         descriptor: what describes the keypoints. "learned" is a small network that also sees the
-            surroundings of a keypoint. "learned-free" was trained only on freely
-            licensed images. "cross-modal" describes the strength of edges by "learned", for images
-            of different sensors, such as infrared and visible light, or for maps. "rootsift" is for
-            programs that expect SIFT descriptors. A path is an ONNX file written by `deepdetect
-            train-descriptor`. An object must have a method `describe(image, keypoints)` like that
-            of this class.
+            surroundings of a keypoint. "learned-free" was trained only on freely licensed images.
+            "cross-modal" applies "learned" to the edge strength, for images of different sensors,
+            such as infrared and visible light, or for maps. "rootsift" is for programs that expect
+            SIFT descriptors. A path is an ONNX file written by `deepdetect train-descriptor`. An
+            object must have a method `describe(image, keypoints)` like that of this class.
         backend, device, precision: as in `DeepDetect`, but only the values that mean ONNX Runtime
             on the CPU in float32 are allowed; others raise an OptionError.
         threads: maximum number of threads. None: one per processor.

@@ -27,7 +27,7 @@ STRIDE = 8
 """The network halves an image three times, so the image's sides must be multiples of 8."""
 
 PADDED_IMAGE = "padded_image"
-"""Name of the padded image, in ONNX files that pad the image to multiples of 8 themselves."""
+"""Name of the tensor of the padded image, in ONNX files that pad images to multiples of 8."""
 
 LOGITS = "logits"
 """Name of the ONNX output that holds logits; an output of another name holds probabilities."""

@@ -1,8 +1,8 @@
 """Running the network `fast` in tiles, for images whose computation would not fit in memory.
 
-The network uses a few numbers about the whole image. Its exposure is computed from every 8th row
-and column, and a first pass over the tiles collects the means and maxima of the features. A second
-pass computes the logits. Tiles overlap by more than the receptive field of the convolutions, so the
+The network uses a few numbers about the whole image: the exposure, computed from every 8th row and
+column, and means and maxima of features, collected by a first pass over the tiles. A second pass
+computes the logits. Tiles overlap by more than the receptive field of the convolutions, so the
 logits are the same as without tiles. (ESPNet cannot be tiled: it needs pixels up to 1,738 px away.)
 """
 
@@ -41,12 +41,12 @@ THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
 """The constants from `COUNTED` to `THRESHOLDS` name the tensors at which the network is cut."""
 
 SCALES, MARGIN = (4, 2, 1), 4
-"""Rows and columns of the three feature maps per stride of 8 px, and the border around each tile in
-strides: convolutions need pixels up to 28 px away."""
+"""The three feature maps have SCALES rows and columns per stride of 8 px. Each tile has a border of
+MARGIN strides, because convolutions need pixels up to 28 px away."""
 
 BYTES_PER_PIXEL, DEFAULT_TILE_MEGAPIXELS = 90, 2.7
-"""Approximate memory, in bytes per pixel, of a run without tiles in ONNX Runtime or OpenVINO, and
-usual size of a tile in megapixels."""
+"""A run without tiles takes about BYTES_PER_PIXEL bytes of memory per pixel in ONNX Runtime or
+OpenVINO. DEFAULT_TILE_MEGAPIXELS is the usual size of a tile."""
 
 Part = Callable[..., list[np.ndarray]]
 
@@ -139,7 +139,7 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
 class _Span(NamedTuple):
     """The extent of a tile along one axis, in strides of 8 pixels.
 
-    `seen` is read, and `core` is written. `inner` is the position of `core` within `seen`.
+    The network reads `seen` and fills `core`. `inner` is the position of `core` within `seen`.
     """
 
     seen: slice

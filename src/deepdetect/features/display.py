@@ -14,8 +14,8 @@ from .._shared.image_array import Channels, array_to_rgb, deep_values
 from .._shared.opencv import cv2
 
 MAX_SIDE_PX, MAX_LINES = 240, 60
-"""Longest side of a figure in an HTML summary, which takes about 10 kB with its table, and maximum
-number of matches drawn as lines in it. Chosen by hand."""
+"""The figure of an HTML summary has a longer side of at most MAX_SIDE_PX, so that the summary takes
+about 10 kB, and shows at most MAX_LINES matches as lines. Chosen by hand."""
 
 Points = tuple[np.ndarray, tuple[int, int]]
 
@@ -43,7 +43,7 @@ def html_summary(
 
     `points` holds the positions and the (width, height) of one image, or of two, which are shown
     side by side. The rows of `lines`, (M, 4), are x0, y0 in the first image and x1, y1 in the
-    second; some of these lines are drawn.
+    second; at most `MAX_LINES` of them are drawn.
     """
     cells = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(text)}</td></tr>"

@@ -18,14 +18,14 @@ TILE_COLUMNS, TILE_HEIGHT = 32, 96
 """Width of a tile of dense SIFT in columns of keypoints, and height in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
-"""Dense SIFT sums this many taps of a filter at a time, so spans of taps are padded to fit."""
+"""Dense SIFT sums this many taps of a filter at a time, so spans are padded to a multiple of it."""
 
 BINS, RADIUS_PER_WINDOW = 36, 3.0
-"""Directions around a keypoint have this many bins, as in Lowe (2004). Pixels within this many
-sigmas of the Gaussian window vote for them, as in OpenCV."""
+"""The histogram of gradient directions around a keypoint has BINS bins, as in Lowe (2004). Pixels
+vote up to RADIUS_PER_WINDOW sigmas of the Gaussian window from the keypoint, as in OpenCV."""
 
 CHUNK = 64
-"""Exact search keeps the minimum of each chunk of this many distances, to find rows faster."""
+"""Exact search keeps the minimum of every CHUNK distances, so that it finds minima faster."""
 
 
 @compiled(nogil=True, fastmath=True)
@@ -34,10 +34,10 @@ def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, t
 
     `magnitude` and `orientation` come from `sift_gradient`. Keypoints lie on a lattice of points
     that are `step` pixels apart; the first is the pixel `origin`, (x, y). `rows_of` holds for each
-    point of the lattice the row of its keypoint in `out`, or -1 without one. `taps`, (4, T),
+    point of the lattice the row of its keypoint in `out`, or -1 without a keypoint. `taps`, (4, T),
     holds for each of the four spatial bins the weights of T pixels along one axis around a
-    keypoint, padded with zeros. `spans`, (4, 3), holds for each bin the first nonzero tap, the end
-    of its span of taps, whose length is a multiple of `TAPS_AT_ONCE`, and T.
+    keypoint, padded with zeros. `spans`, (4, 3), holds for each bin the index of the first nonzero
+    tap, the end of its span of taps (a multiple of `TAPS_AT_ONCE` long), and T.
     """
     height, width = magnitude.shape
     reach = spans[0, 2] // 2
@@ -187,8 +187,8 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
 def scan_products(products, terms0, terms1, start, rows, values, nearest, best, second):  # type: ignore[no-untyped-def]
     """Find nearest neighbours in both directions between a block of queries and the base.
 
-    Squared distances are `terms0[i] + terms1[j] - 2 * products[i, j]`. The first query of the block
-    has the number `start`. For each query, its K nearest rows of the base (the lower row of a tie)
+    Squared distances are `terms0[i] + terms1[j] - 2 * products[i, j]`. `start` is the index of the
+    block's first query. For each query, its K nearest rows of the base (the lowest row of a tie)
     are written into `rows`, and their squared distances into `values`. For each row of the base,
     `nearest` is updated to the nearest query of all blocks so far, and `best` and `second` to the
     squared distances of the two nearest queries.
@@ -263,12 +263,12 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Improve the two best matches of each query in the bands `first` to `last` (exclusive).
 
-    `bands` holds the number of the first query in each band; queries are in row-major order. `at0`
+    `bands` holds the index of the first query in each band; queries are in row-major order. `at0`
     and `at1` hold the row of the keypoint at each pixel of the two images, or -1. `turn` is the
     number of the sweep: even sweeps go down the image, odd ones up. Two kinds of candidates are
     tried for a query: the matches of the queries at `offsets` from it, shifted by the offset, and
-    random keypoints within `radii` around its best match. For queries of other bands, the matches
-    from `before` this sweep are used, so that the order of the bands does not matter.
+    random keypoints within `radii` around its best match. For a query of another band, its match
+    before this sweep (`before`) is used, so that the order of the bands does not matter.
     """
     (height0, width0), (height1, width1) = at0.shape, at1.shape
     direction = 1 - 2 * (turn % 2)
@@ -316,7 +316,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, error_model="numpy")
 def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignore[no-untyped-def]
-    """Keep each point, best first, unless a kept one is closer than the smaller of their two radii.
+    """Keep each point, best first, unless a kept point is closer than the smaller of both radii.
 
     No position is negative. The rows of kept points are written into `kept` until it is full, and
     their number is returned. To find near points, the image is divided into squares with sides of
@@ -349,7 +349,7 @@ ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-"""Coefficients of OpenCV's arctangent, in degrees: votes then go to the same bins as in OpenCV."""
+"""Coefficients of OpenCV's arctangent, in degrees, so that votes go to OpenCV's bins."""
 
 
 @compiled(nogil=True, error_model="numpy")

@@ -15,7 +15,7 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Diameter of a keypoint divided by its "scale" for LightGlue, for both meanings of "scale"."""
+"""Ratio of a keypoint's diameter to its "scale" in LightGlue, for both meanings of "scale"."""
 
 MAX_COORDINATE_BITS = 12
 """`bayer_order` uses at most this many bits of x and y, so that ranks are exact in float32."""
@@ -339,7 +339,7 @@ def nearest_keypoints(
     pixels = np.floor(np.asarray(xy) + np.float32(0.5)).astype(np.int64).reshape(-1, 2)
     rows = np.flatnonzero(((pixels >= 0) & (pixels < image_size)).all(axis=1))[::-1]
     grid = np.full((height, width), -1, np.int32)
-    grid[pixels[rows, 1], pixels[rows, 0]] = rows  # reversed: the first on a pixel remains
+    grid[pixels[rows, 1], pixels[rows, 0]] = rows  # reversed: the first keypoint remains
     positions, xy = (np.ascontiguousarray(points, np.float64) for points in (positions, xy))
     nearest = np.full(len(positions), -1, np.int32)
     distances = np.full(len(positions), np.inf)

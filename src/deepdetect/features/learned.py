@@ -15,28 +15,28 @@ LEARNED_FREE: Final = "learned-free"
 CROSS_MODAL: Final = "cross-modal"
 """Values of `Keypoints.descriptor_type` for learned descriptors. "learned-free" was trained only on
 freely licensed photographs. "cross-modal" is for images of different sensors, in which dark and
-bright may be swapped: "learned" descriptors of the strength of their edges. For your own weights,
-the type is "learned-" and the start of the SHA-256 of their file."""
+bright may be swapped: "learned" descriptors of the edge strength instead of the luma. For your own
+weights, the type is "learned-" and the start of the SHA-256 of their file."""
 
 RATIO, LEARNED_RATIO = 0.85, 0.88
 RATIOS = {LEARNED: 0.91, CROSS_MODAL: 0.90}
-"""Limits of Lowe's ratio test: for descriptors that are not learned, for other learned ones, and by
-type. On photos/val, each matches unrelated photographs as often as RootSIFT at 0.85, and is more
-precise on views of one photograph."""
+"""Limits of Lowe's ratio test: RATIO for types that are not learned, RATIOS for two learned types,
+LEARNED_RATIO for the others. On photos/val, each limit matches unrelated photographs as often as
+RootSIFT at 0.85, and is more precise on views of one photograph."""
 
 LENGTH, CONSTANT = 64, 16
 """The first 16 of the 64 numbers of a learned descriptor do not change if the image is rotated."""
 
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
-"""The other 48 numbers are first the real and then the imaginary parts of 24 complex numbers. If
-the image is rotated, the phase of each grows by the angle times its factor in this array."""
+"""The last 48 numbers of a descriptor are the real, then the imaginary parts of 24 complex numbers.
+A rotation of the image adds the angle times the factor in this array to each number's phase."""
 
 UPRIGHT_DEGREES = 15.0
 """Smaller rotations between images need not be undone: networks have learned to tolerate them."""
 
 TURNED_KEYPOINTS = 512
-"""This many keypoints of each image, the best ones, are matched to estimate the rotation between
-the images. Chosen by hand."""
+"""The rotation between two images is estimated by matching this number of the best keypoints of
+each image. Chosen by hand."""
 
 HISTOGRAM_DEGREES, NEAR_DEGREES = 10, 20
 """`common_turn` makes a histogram of angles with bins of width `HISTOGRAM_DEGREES`. It returns the

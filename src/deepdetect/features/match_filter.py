@@ -23,8 +23,8 @@ from .sift import ROOT_SIFT
 MATCH_FILTER = Path(__file__).with_name("match_filter.onnx")
 
 AROUND, MOST_DISTINCT = 8, 512
-"""The network judges a match by this many nearest matches in each image. The second number of
-matches, those with the lowest ratios, tell the rotation between images. Chosen by hand."""
+"""The network judges a match by its AROUND nearest matches in each image. The MOST_DISTINCT matches
+with the lowest ratios determine the rotation between the images. Chosen by hand."""
 
 FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
 """FLANN's codes for a kd-tree for few dimensions, and for an exact search."""
@@ -110,5 +110,5 @@ def nearest_rows(xy: np.ndarray) -> np.ndarray:
     tree = cv2.flann_Index(xy, {"algorithm": FLANN_KDTREE_SINGLE, "leaf_max_size": 10})
     near = tree.knnSearch(xy, AROUND + 1, params={"checks": ALL_LEAVES})[0].astype(np.int64)
     # Each position's own row is moved to the end and dropped. If many positions coincide, the own
-    # row may be missing, and the last of the other rows is dropped.
+    # row may be missing; then the last row is dropped.
     return np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]

@@ -28,27 +28,27 @@ MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
 """Maximum length of uint8 descriptors whose squared distances are exact in single precision."""
 
 PRODUCTS = Path(__file__).with_name("products")
-"""Folder of ONNX files with one matrix product each, made by `tools/product_graphs.py`. NumPy takes
-twice the time for a product in single precision, and its threads stay busy afterwards."""
+"""Folder of ONNX files that multiply two matrices, made by `tools/product_graphs.py`. NumPy takes
+twice the time for a product in single precision, and NumPy's threads stay busy afterwards."""
 
 MAX_EXACT_PRODUCT = 4e8
-"""The matcher "auto" searches exactly up to this product of keypoint counts. Chosen by hand."""
+"""Maximum product of the two keypoint counts for which "auto" searches exactly. Chosen by hand."""
 
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
-"""FLANN's code for kd-trees, the number of trees, and the number of leaves that each query visits,
-as in the paper's code."""
+"""FLANN's code for kd-trees, the number of trees, and the number of leaves that the search for each
+query visits, as in the code of the DeepDetect paper."""
 
 SWEEPS, BAND_HEIGHT_PX = 4, 96
-"""Number of PatchMatch's sweeps over all queries, alternately down and up, and height of the bands
-of the first image that its threads process. Chosen by hand."""
+"""PatchMatch passes SWEEPS times over all queries, alternately down and up the first image. Its
+threads process bands of BAND_HEIGHT_PX rows of this image. Chosen by hand."""
 
 OFFSETS_PX = (1, 4, 12)
-"""PatchMatch tries, for each query, the shifted matches of queries at these distances in x or in y.
-The smallest distance is 1 px because dense keypoints are 1 px apart."""
+"""PatchMatch tries, for each query, the matches of queries at these distances in x or y, shifted by
+the distance. The smallest distance is 1 px, because dense keypoints are 1 px apart."""
 
 SEARCH_SHRINK = 3
-"""PatchMatch also tries random positions around the best match. The first radius is half the longer
-side of the image, and each further one the previous one divided by this number."""
+"""PatchMatch also tries random positions around the best match. The search radius starts at half
+the longer side of the image, and is divided by this number again and again."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
 """Nearest neighbours of N queries: their rows in the base, (N, count) int32, and their distances,
@@ -70,8 +70,8 @@ def exact_neighbours(
 ) -> Neighbours:
     """Find the exact nearest neighbours by matrix products; a `Matcher`.
 
-    Among equally near rows of the base, the lower is taken. The time grows with the product of the
-    numbers of queries and rows, so this suits up to tens of thousands of keypoints.
+    Among equally near rows of the base, the row of lowest index is taken. The time grows with the
+    product of the numbers of queries and rows, so this suits up to tens of thousands of keypoints.
     """
     return _search_both_ways(queries, base, count)[:2]
 
@@ -93,7 +93,7 @@ def _search_both_ways(
     else:
         queries, base = (np.asarray(part, np.float32) for part in (queries, base))
         session, factor = session_of(PRODUCTS / "float.onnx"), np.ascontiguousarray(base.T)
-    found = min(count + 1, len(base))  # one more, to detect ties within rounding errors
+    found = min(count + 1, len(base))  # one more row, to detect ties within rounding errors
     rows = np.empty((len(queries), found), np.int32)
     squared = np.empty((len(queries), found), np.float32)
     nearest = np.zeros(len(base), np.int32)
@@ -107,7 +107,7 @@ def _search_both_ways(
         scan_products(*block, rows[part], squared[part], nearest, best, second)
     if whole or not len(queries):
         return rows[:, :count], np.sqrt(squared[:, :count]), nearest
-    # Rounding errors of squared distances are below `bound`, relative to the descriptors' lengths.
+    # Rounding errors of squared distances are below `bound` times the squared sum of both lengths.
     # Neighbours whose squared distances differ by less are searched again in double precision.
     lengths = np.sqrt(terms0), np.sqrt(terms1)
     bound = (width / 2 + 8) * float(np.finfo(np.float32).eps)
@@ -135,7 +135,7 @@ def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.
     step = max(1, BLOCK_SIZE // (2 * len(base)))
     for start in range(0, len(queries), step):
         block = squares - 2 * (queries[start : start + step].astype(np.float64) @ base.T)
-        for rank in range(count):  # `argmin` takes the lower row of a tie
+        for rank in range(count):  # `argmin` returns the lowest row of a tie
             rows[start : start + step, rank] = nearest = block.argmin(1)
             block[np.arange(len(block)), nearest] = np.inf
     return rows
@@ -143,7 +143,7 @@ def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.
 
 @functools.cache
 def session_of(path: Path) -> Any:
-    """Return a session of a bundled ONNX file, always the same one."""
+    """Return the ONNX Runtime session of a bundled ONNX file, which is created once and cached."""
     return start_session(str(path))
 
 
@@ -152,7 +152,7 @@ def _byte_product() -> tuple[Any, int]:
     """Return a session that multiplies matrices of bytes, and the offset to subtract from the base.
 
     The fastest instructions (VNNI) multiply unsigned by signed bytes, so 128 is subtracted from the
-    base. On processors without VNNI, sums of such products saturate. There both matrices stay
+    base. Processors without VNNI saturate the sums of such products; for them both matrices stay
     unsigned, and the offset is 0.
     """
     session = session_of(PRODUCTS / "signed.onnx")
@@ -210,11 +210,11 @@ def patchmatch_neighbours(
 ) -> Neighbours:
     """Find one or two approximate nearest neighbours of each query by PatchMatch; a `Matcher`.
 
-    If a query lies next to another one, the other's match, shifted by the offset between the two,
-    is probably a good match (Barnes et al., "PatchMatch", 2009). On hundreds of thousands of dense
-    keypoints, PatchMatch takes a twentieth of FLANN's time and finds more correct matches, but it
-    does not suit few or scattered keypoints. Descriptors must be uint8 and keypoints on whole
-    pixels. The number of threads does not change the result.
+    The match of a neighbouring query, shifted by the offset between the two queries, is probably a
+    good match of the query itself (Barnes et al., "PatchMatch", 2009). On hundreds of thousands of
+    dense keypoints, PatchMatch takes a twentieth of FLANN's time and finds more correct matches,
+    but it does not suit few or scattered keypoints. Descriptors must be uint8 and keypoints on
+    whole pixels. The number of threads does not change the result.
     """
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(
@@ -227,7 +227,7 @@ def patchmatch_neighbours(
     from . import kernels
 
     xy0, xy1 = (np.asarray(xy).astype(np.int32) for xy in positions)
-    # Queries are sorted in row-major order, because a sweep builds on the queries before.
+    # Queries are sorted in row-major order, because a sweep reuses the previous matches.
     order = np.lexsort((xy0[:, 0], xy0[:, 1]))
     queries, xy0 = queries[order], xy0[order]
     at0, at1 = _grid(xy0), _grid(xy1)
@@ -250,7 +250,7 @@ def patchmatch_neighbours(
 
 
 def _grid(xy: np.ndarray) -> np.ndarray:
-    """Return an image with the row of the position at each pixel, and -1 at pixels without one."""
+    """Return an image that holds, at each pixel, the row of the position there, or -1."""
     width, height = xy.max(axis=0) + 1
     grid = np.full((height, width), -1, np.int32)
     grid[xy[:, 1], xy[:, 0]] = np.arange(len(xy))
@@ -294,7 +294,7 @@ class DescriptorMatches:
     """Matches between two sets of descriptors.
 
     `indices0` and `indices1` are the matched rows of the two sets, (M,) each. `ratios` are Lowe's,
-    (M,) float32: the distance to the nearest descriptor divided by that to the second-nearest.
+    (M,) float32: the distance to the nearest descriptor over that to the second-nearest.
     `filter_matches` replaces the ratios by the probabilities that matches are wrong.
     """
 

@@ -38,14 +38,14 @@ class Evidence:
             expected number of geometries with as many inliers among random matches.
         simulated_views: number of views that were simulated to find the geometry, as in ASIFT.
         on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
-        verified: fraction of what both images show in common that the geometry explains: places
-            that are more similar than nearly all places of displaced copies.
-        agreement: fraction of the places with structure that do not contradict the geometry.
+        verified: fraction of the images' overlap that the geometry explains: places where the
+            images are more similar than nearly all places of displaced copies.
+        agreement: fraction of the places with structure where the images do not contradict it.
         correlation: median correlation of the descriptors at places with structure. In a scene with
-            depth, the place in the second image is predicted by the matches around, not by those
-            at the place itself. 0 if there are few matches.
-        left_out: share of the image that was left out, because it stands still while the scene
-            moves: a frame, a caption, a logo, the own vehicle.
+            depth, only the surrounding matches, not those at the place itself, predict where the
+            second image shows it. 0 if there are few matches.
+        left_out: fraction of the image that was left out, because it stays in place while the scene
+            moves: a frame, a caption, a logo, or the vehicle that carries the camera.
     """
 
     tentative_matches: int = 0
@@ -63,13 +63,13 @@ class Evidence:
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One of the geometries of a pair: of the scene, or of something that moves on its own.
+    """One of several geometries of an image pair: of the scene, or of an object that moves.
 
     Attributes:
         model: "homography" or "fundamental".
         matrix: (3, 3) float64, as of `TwoViewGeometry`.
-        share: fraction of what both images show in common that this geometry explains; 0 if it is
-            known from sparse matches only.
+        share: fraction of the images' overlap that this geometry explains; 0 if only sparse matches
+            support the geometry.
     """
 
     model: str
@@ -98,8 +98,8 @@ class TwoViewGeometry:
         confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" if the model
             is "none".
         evidence: the measurements on which the decision rests.
-        layers: what guided matching found, the geometry that explains most first. The others
-            explain what moves on its own. `Matches.layer` tells which of them a match follows.
+        layers: the geometries that guided matching found. The first explains most of the images,
+            the others explain moving objects. `Matches.layer` tells which geometry a match follows.
     """
 
     model: str
@@ -158,7 +158,7 @@ class GuidedMatches:
         return xy0[self.indices0] if self.points0 is None else self.points0
 
     def chosen(self, rows: np.ndarray) -> GuidedMatches:
-        """Return some of the matches of keypoints."""
+        """Return the matches in the chosen rows, without `points0`, `alike` and `layer`."""
         indices1 = None if self.indices1 is None else self.indices1[rows]
         columns = self.indices0[rows], self.points1[rows], self.scores[rows]
         return GuidedMatches(*columns, self.subpixel, indices1)
@@ -190,7 +190,7 @@ class Matches:
             the correlation of both patches or of their descriptors. Otherwise, 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
             `GeometryOptions.inlier_threshold`; all matches if there is no geometry yet. Guided
-            matches that the surrounding image contradicts are no inliers.
+            matches that the surrounding image contradicts are not inliers.
         keypoints0, keypoints1: all keypoints of the two images.
         seconds: time of each stage of the matching, for both images together, by the stage's name.
         geometry: the geometry between the images; None for `match_features`, which estimates none.
@@ -201,8 +201,8 @@ class Matches:
             whose pixel a match starts, and `indices1` the keypoint nearest to its end, up to a
             pixel away, or -1 (`m[m.indices1 >= 0]` drops matches without a keypoint); with
             `mutual`, these roles may be swapped. None: the nearest keypoints are looked up.
-        layer: (M,) int8, which of `geometry.layers` a match follows, or -1 without layers, for
-            which None stands: `m[m.layer == 0]` has the matches of the scene.
+        layer: (M,) int8 index in `geometry.layers` of the geometry that a match follows; -1 (or
+            None for all) without layers. `m[m.layer == 0]` has the matches of the scene.
 
     With the same options, an index means the same keypoint in all pairs with this image, because
     keypoints do not depend on the other image. So matches of several pairs can be joined to tracks.
@@ -246,11 +246,11 @@ class Matches:
                 f"matches need equally many points0, points1, scores and inliers, not {counts}"
             )
         if not (np.isfinite(self.points0).all() and np.isfinite(self.points1).all()):
-            raise OptionError("matches need finite positions: leave out those that are not finite")
+            raise OptionError("matches need finite positions: leave out the other matches")
         for side in (0, 1):
             name = f"indices{side}"
             indices = getattr(self, name)
-            # Without matches, keypoints that are found on first access are not looked for.
+            # Without matches, keypoints that are detected on first access stay undetected.
             keypoints: Any = getattr(self, f"keypoints{side}") if len(self) else ()
             if indices is None and len(self):
                 indices, distances = nearest_keypoints(
@@ -276,7 +276,7 @@ class Matches:
         object.__setattr__(self, "layer", layer.astype(np.int8))
 
     def __getstate__(self) -> dict[str, Any]:
-        # The state that is pickled holds the keypoints, not functions that find them.
+        # The pickled state holds the keypoints themselves, not functions that detect them.
         return {**self.__dict__, "keypoints0": self.keypoints0, "keypoints1": self.keypoints1}
 
     @property
@@ -286,9 +286,9 @@ class Matches:
 
     @property
     def pairs(self) -> np.ndarray:
-        """(K, 2) uint32 rows of `keypoints0` and `keypoints1`, as COLMAP and kornia take matches.
+        """(K, 2) uint32 rows of `keypoints0` and `keypoints1`: matches as in COLMAP and kornia.
 
-        Matches with an end that is no keypoint are left out.
+        Matches with an end that is not a keypoint are left out.
         """
         found = np.column_stack([self.indices0, self.indices1])
         return found[(found >= 0).all(axis=1)].astype(np.uint32)
@@ -333,7 +333,7 @@ class Matches:
         return [cv2.DMatch(i, j, d) for i, j, d in zip(*columns, strict=True) if min(i, j) >= 0]
 
     def unique(self) -> Matches:
-        """Return one-to-one matches: those with the highest score of all matches at both ends.
+        """Return one-to-one matches: each has the highest score of all matches at both its ends.
 
         An end is a keypoint or, without one, a pixel. Among equal scores the first match is kept.
 

@@ -20,8 +20,8 @@ from .matches import Matches
 from .selection import spread_over_grid
 
 SHOWN_KEYPOINTS, AREA_OF_KEYPOINT_PX = 1000, 200
-"""Pictures show at most this many keypoints, and at most one per this many square pixels, so that
-all can be told apart. Chosen by hand."""
+"""Pictures show at most SHOWN_KEYPOINTS keypoints, and at most one per AREA_OF_KEYPOINT_PX square
+pixels, so that viewers can tell them apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
 """Colours start at this level of the scale from 0 to 1, because darker colours are hard to see."""

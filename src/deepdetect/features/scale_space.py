@@ -9,15 +9,15 @@ import numpy as np
 from .._shared.opencv import cv2
 
 LAYERS = 3
-"""Layers with keypoints per octave, as in Lowe (2004). Each multiplies sigma by 2^(1/3)."""
+"""Number of layers with keypoints per octave (Lowe, 2004). Sigma grows by 2^(1/3) per layer."""
 
 BASE_SIGMA_PX, CAMERA_SIGMA_PX = 1.6, 0.5
-"""Sigma of the blur of the first image of an octave, in the octave's pixels, and of the blur that
-the camera is assumed to have caused, as in Lowe (2004)."""
+"""BASE_SIGMA_PX is the sigma of an octave's first image, in the octave's pixels. CAMERA_SIGMA_PX is
+the sigma of the blur that the camera is assumed to have caused. Both are as in Lowe (2004)."""
 
 SIZE_PER_SIGMA, WINDOW_PER_SIGMA = 2.0, 1.5
-"""The size of a SIFT keypoint in OpenCV, and the sigma of the Gaussian window for its orientation,
-as in Lowe (2004), in sigmas of the keypoint's scale."""
+"""Size of a SIFT keypoint in OpenCV, and sigma of the Gaussian window for its orientation (Lowe,
+2004), both divided by the sigma of the keypoint's scale."""
 
 MIN_SIDE_PX = 8
 """Octaves are not used if a side of their images is shorter than this. Chosen by hand."""

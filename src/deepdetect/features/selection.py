@@ -202,7 +202,7 @@ def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -
     """Return a bit mask, packed along the rows, of pixels above the threshold and not ignored."""
     if ignore is not None:
         ignore = check_ignore(ignore, maps.shape)
-    # A density may need all pixels except those with a probability of 0.
+    # With a density, all pixels with a probability above 0 may become keypoints.
     threshold = options.threshold if options.density is None else 0.0
     packed, heatmap = [], maps.heatmap()
     for rows in bands(maps.shape):
@@ -237,7 +237,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
     in_bands = list(bands(ranking.shape))
-    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # computed once
+    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # a single band is computed once
     lowest = np.float32(-np.inf)
     if count is not None:
         parts = (ranks[wanted(rows) if only is None else only] for rows in in_bands)
@@ -345,7 +345,7 @@ def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def without_frame(rgb: np.ndarray, ignore: np.ndarray | None) -> np.ndarray | None:
-    """Return the ignore mask of a (H, W, 3) image with its uniform frame, if it has one."""
+    """Add the uniform frame of a (H, W, 3) image, if it has one, to the image's ignore mask."""
     frame = uniform_frame(rgb)
     return ignore if not frame.any() else frame if ignore is None else frame | ignore
 
@@ -386,7 +386,7 @@ def descending_order(values: np.ndarray) -> np.ndarray:
     """
     if values.dtype != np.float32:
         return np.argsort(-values, kind="stable")
-    # Read as integers, the bits of floats have the order of their magnitudes.
+    # The bits of floats, read as integers, have the same order as the floats' magnitudes.
     bits = (values + np.float32(0)).view(np.int32)
     keys = np.where(bits < 0, bits & 0x7FFFFFFF, ~bits).astype(np.int64) << 32
     keys |= np.arange(len(values))
@@ -397,7 +397,7 @@ def descending_order(values: np.ndarray) -> np.ndarray:
 def suppress_neighbors(
     xy: np.ndarray, scores: np.ndarray, radius_px: float | np.ndarray, max_count: int | None = None
 ) -> np.ndarray:
-    """Keep each point, from the best on, unless it is near a kept one; return the kept rows.
+    """Keep the points, best first, that are not near a better kept point; return the kept rows.
 
     The rows are ordered best first; among equal scores, the lower row counts as better. Two points
     are near if their distance is below the radius or, with (N,) radii, below the smaller of their

@@ -21,8 +21,8 @@ ROOT_SIFT: Final = "rootsift"
 """Value of `Keypoints.descriptor_type` for RootSIFT."""
 
 DENSE_SIZES_PX, MIN_DENSE_DENSITY = (2.0, 8.0), 0.02
-"""Range of keypoint diameters, in pixels, that `dense_sift` supports, and keypoints per pixel above
-which it is faster than describing keypoints one by one."""
+"""`dense_sift` supports keypoint diameters in the range DENSE_SIZES_PX. Above MIN_DENSE_DENSITY
+keypoints per pixel, it is faster than describing keypoints one by one."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
@@ -39,7 +39,7 @@ def sift_descriptors(
     Many upright keypoints on whole pixels are described by `dense_sift`, whose result differs from
     OpenCV's by 1 in one of ten thousand numbers. Other keypoints are described by OpenCV. The size
     is a diameter in pixels, the angle is in degrees. The angle -1 usually means unset, but OpenCV's
-    SIFT takes it for a rotation by one degree, as in the paper's published code.
+    SIFT reads it as a rotation by one degree, as in the paper's published code.
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and DENSE_SIZES_PX[0] <= size <= DENSE_SIZES_PX[1]

@@ -10,8 +10,8 @@ Focal lengths and positions are in pixels, and the centre of the first pixel is 
      "disparity_offset_px": 66.7,   cx right minus cx left; default: computed from the values of cx
      "left": {...}, "right": {...}} values for one view only: focal_px, cx, cy, width, height
 
-Without `baseline_mm`, lengths are in multiples of the baseline. Other numbers are refused, except
-zeros: distortion, for example, would be lost. Other texts and objects are ignored.
+Without `baseline_mm`, lengths are in multiples of the baseline. Numbers other than 0 under other
+keys raise an error, because distortion would be lost. Other texts and objects are ignored.
 """
 
 from __future__ import annotations
@@ -370,7 +370,7 @@ class PosedView:
 
 def camera_spacing(centres: np.ndarray) -> float:
     """Return the median distance from a camera to its nearest neighbour; `centres` is (V, 3)."""
-    blocks = np.array_split(centres, len(centres) // 500 + 1)  # the blocks bound the memory
+    blocks = np.array_split(centres, len(centres) // 500 + 1)  # blocks limit the use of memory
     distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
     second = min(1, len(centres) - 1)  # index 0 is the camera itself
     nearest = [np.partition(each, second, axis=1)[:, second] for each in distances]

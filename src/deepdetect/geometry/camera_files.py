@@ -42,8 +42,8 @@ def read_camera_file(path: Path, image: Pair = None, views: Pair = None) -> dict
     """Read a camera file, or a folder with two; return a dictionary with the keys of calib.json.
 
     `image` is the (width, height) of the first image, if it is known, and `views` the numbers of
-    left and right camera in KITTI's files, which have several. The key "format" of the result says
-    whose file it is.
+    the left and right camera in KITTI's files, which hold several cameras. The key "format" of the
+    result names the format.
 
     Raises:
         ReconstructionError: the format is unknown, or the cameras have distortion.
@@ -97,7 +97,7 @@ def _parsed(content: bytes) -> Values:
     if values is None:
         values = _yaml(text)
     if isinstance(values, list) and any(isinstance(each, Mapping) for each in values):
-        values = dict(enumerate(values))  # a list of words is a [section]
+        values = dict(enumerate(values))  # "[section]" is a list of words
     values = values if isinstance(values, dict) else _text(lines)
     if not values and text[:1] != "{":
         raise ReconstructionError(f"it holds no cameras: {KNOWN}")
@@ -114,7 +114,7 @@ def _yaml(text: str) -> Any:
     body = re.sub(r"\A%YAML[^\n]*\n", "", text).replace("\t", " ")
     body = re.sub(
         r"^( *[\w.]+):(?=[-.\d[])", r"\1: ", body, flags=re.MULTILINE
-    )  # as OpenCV reads it
+    )  # OpenCV reads "key:1" like "key: 1"
     try:
         values: Any = next(yaml.load_all(body, Loader), None)
     except yaml.YAMLError:
@@ -143,7 +143,7 @@ def _text(lines: str) -> Values:
             key, value = key.strip(), (value or "").strip()
             if start or (sign and value and name and name not in section):
                 section = values.setdefault(key if start else name, {})
-            if sign and value and key in section:  # the next of several cameras
+            if sign and value and key in section:  # a repeated key starts the next camera
                 section = values.setdefault(f"{len(values)}", {})
             if sign and value:
                 section[key] = numbers_in(value) or value

@@ -1,8 +1,8 @@
 """Formats of camera files: readers of the parsed files, and what all readers share.
 
-A reader takes the parsed file and the (width, height) of the image, if it is known, and returns it
-in usual names: cameras as objects with fx, fy, cx, cy or a matrix K, those of a pair as "left" and
-"right" or with their poses, and "baseline_mm". It returns None for a file of another format.
+A reader takes the parsed file and the image's (width, height), if known, and returns the values by
+their usual names: cameras as objects with fx, fy, cx, cy or a matrix K, those of a pair as "left"
+and "right" or with their poses, and "baseline_mm". It returns None for a file of another format.
 `cameras_in` does the rest: it finds the cameras, checks them, and makes the keys of calib.json.
 """
 
@@ -26,16 +26,16 @@ MM_PER_M = 1000.0
 MM_PER_CM = 10.0
 
 METRES_BELOW, MM_FROM = 1.0, 30.0
-"""A baseline without a unit is in metres below the first number, and in mm from the second on. What
-lies between may also be in cm, or in squares of a chessboard, which OpenCV's example counts."""
+"""A baseline without a unit is in metres if it is below METRES_BELOW, and in mm from MM_FROM on. A
+number in between may be in cm, or in squares of a chessboard, which OpenCV's example counts."""
 
 ROUNDING = 1e-9
 """Distortion coefficients up to this are zeros with rounding errors, because even at the corner of
 a large image they would move a pixel by less than a ten-thousandth."""
 
 MIN_FOCAL = 0.1
-"""A focal length under this fraction of the longer side of the image is refused as one in another
-unit, because in pixels it would mean a pinhole camera with a field of view above 157 degrees."""
+"""A focal length under this fraction of the image's longer side is rejected as not being in pixels,
+because the pinhole camera would have a field of view above 157 degrees."""
 
 MATRIX = r"(?:new|color|rgb|cam(?:era)?)*(?:intrinsics?)?(?:matrix|mtx)|intrinsics?|cam|[km]"
 PROJECTION = r"p|projection(?:matrix)?"
@@ -68,7 +68,7 @@ CROPS = re.compile(r"[xy]_offset|binning_[xy]")
 BASELINES = re.compile(
     r"(?:stereo)?baseline(?:in)?(?:(mm|millimet\w+)|(cm|centimet\w+)|(m|met\w+))?"
 )
-"""Names of distortion, of a part of the sensor, and of a baseline in mm, cm, metres or no unit."""
+"""Names of distortion coefficients, crops of the sensor, and baselines (mm, cm, m, no unit)."""
 
 ZED_SIZES = {
     **{"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200)},
@@ -78,11 +78,11 @@ ZED_SIZES = {
 
 
 class Format(NamedTuple):
-    """A format: whose file it is, a pattern that one of its keys has, and its reader, if needed.
+    """A file format: its name, a pattern that one of its keys matches, and its reader, if needed.
 
-    `first` is the x and y of the centre of the first pixel; None means 0, but 1 for MATLAB's
-    matrix. Principal points may also begin in the "middle"; "fractions" are of the longer side of
-    the image, from its middle.
+    `first` is the x and y of the first pixel's centre; None means 0, or 1 for MATLAB's transposed
+    matrix. "middle": principal points are relative to the image centre. "fractions": they are
+    relative to the image centre, in fractions of the longer side.
     """
 
     name: str
@@ -115,7 +115,7 @@ def numbers_in(value: Any) -> list[float]:
 
 
 def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
-    """Return a list, text or OpenCV's matrix of one of the sizes as three rows, or else None."""
+    """Return a matrix whose number of elements is in `sizes`, as three rows; otherwise None."""
     nested = value[0] if isinstance(value, list) and value else value
     if isinstance(nested, Mapping) and "data" not in nested:
         return None
@@ -128,7 +128,7 @@ def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
 
 
 def matrices(values: Values, name: str, *sizes: int) -> list[np.ndarray]:
-    """Return the matrices of the left and the right camera, by their keys, or the first one."""
+    """Return the matrices of the left and right camera, by their keys, or the first matrix."""
     found: dict[str, np.ndarray] = {}
     for key, value in values.items():
         match = re.fullmatch(rf"(left|right|l|r)?({name})(left|right|l|r|[012])?", short(key))
@@ -149,7 +149,7 @@ def objects_in(values: Any, name: str = "") -> Iterator[tuple[str, Values]]:
 
 
 def in_mm(length: float, unit: float | None = None) -> float | None:
-    """Return a length in mm by its unit in mm, if that is known, else by its size; None for 0."""
+    """Convert a length to mm by `unit` (in mm) or, without it, by size. None if unclear or 0."""
     if unit is None:
         unit = MM_PER_M if length < METRES_BELOW else float(length >= MM_FROM)
         if not unit:
@@ -162,7 +162,7 @@ def in_mm(length: float, unit: float | None = None) -> float | None:
 
 
 def baseline_in(values: Values, pair: bool) -> float | None:
-    """Return the baseline in mm that an object states, or None. A pair may have it as T."""
+    """Return the baseline in mm that an object states, or None. Pairs may have a vector T."""
     for key, value in values.items():
         if match := BASELINES.fullmatch(short(key)):
             units = zip(match.groups(), (1.0, MM_PER_CM, MM_PER_M), strict=True)
@@ -176,7 +176,7 @@ def baseline_in(values: Values, pair: bool) -> float | None:
 
 
 def check_pinhole(values: Values) -> None:
-    """Raise an error if one of the values says that the camera is no pinhole without distortion."""
+    """Raise an error if a value says that the camera has distortion or is not a pinhole."""
     for key, value in values.items():
         name = short(key)
         words = value.replace("_", " ") if isinstance(value, str) else ""
@@ -205,11 +205,11 @@ def check_pinhole(values: Values) -> None:
 
 
 def _pair_at(values: Values, choices: Iterable[tuple[str, ...]]) -> list[float]:
-    """Return the two numbers (one is repeated) at the first names that there are, or none."""
+    """Return the two numbers under the first names found, or none; a single number is repeated."""
     for names in choices:
         if numbers := [n for name in names for n in numbers_in(values.get(name))]:
             if len(numbers) < len(names):
-                raise ReconstructionError(f"it lacks {names[0]} or {names[1]}: add the other")
+                raise ReconstructionError(f"it lacks {names[0]} or {names[1]}: add the missing one")
             return (numbers * 2)[:2]
     return []
 
@@ -239,7 +239,7 @@ def _of_matrix(matrix: np.ndarray, first: Any) -> tuple[list[float], list[float]
 
 
 def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
-    """Return the view that one object describes in the usual names, in the keys of calib.json.
+    """Convert an object with the usual names to one view, with the keys of calib.json.
 
     If the object describes no camera, None is returned.
     """
@@ -285,7 +285,7 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
 def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
     """Return the cameras of a file in a dictionary with the keys of calib.json, or None.
 
-    Rectified projection matrices come before other matrices, which come before single numbers.
+    Rectified projection matrices are preferred to other matrices, and these to single numbers.
     """
     found: list[tuple[str, dict[str, Any], list[float]]] = []
     length, distorted = None, False
@@ -335,7 +335,7 @@ def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
         different = {repr(view): view for view in fitting}
         if len(different) > 1:
             raise ReconstructionError(
-                f"it has {len(different)} different cameras: give a file with that of these images"
+                f"it has {len(different)} different cameras: give a file with the one of the images"
             )
         left, right, length = fitting[0], fitting[0], None
     values = {"left": left, "right": right, "baseline_mm": length}
@@ -379,8 +379,8 @@ def kitti(values: Values, image: Pair) -> Values | None:
     first, second = next(pairs, (only, only))
     if wanted and wanted != (first, second):
         warnings.warn(
-            f"the calibration lacks the cameras {wanted[0]} and {wanted[1]} or one of them, which "
-            f"the images are from: its cameras {first} and {second} are taken instead",
+            f"the images are of the cameras {wanted[0]} and {wanted[1]}, but the calibration lacks "
+            f"one or both: its cameras {first} and {second} are used instead",
             stacklevel=2,
         )
     size = {"resolution": values.get(f"S_rect_0{first}")}
@@ -394,7 +394,7 @@ def middlebury(values: Values, image: Pair) -> Values | None:
 
 
 def orb_slam(values: Values, image: Pair) -> Any:
-    """Read settings of ORB-SLAM or stella_vslam. Lengths are in metres, also in fx * baseline."""
+    """Read settings of ORB-SLAM or stella_vslam, with lengths in metres; bf is fx * baseline."""
     shared: Any = values.get("Camera", {})
     if not isinstance(shared, Mapping):
         return None
@@ -406,18 +406,18 @@ def orb_slam(values: Values, image: Pair) -> Any:
     metres = metres or float(stereo.get("b", 0))
     metres = metres or math.hypot(*numbers_in(stereo.get("T_c1_c2"))[3:12:4])
     if re.search("depth_?map_?factor", str(values), re.IGNORECASE):
-        metres = 0.0  # the two cameras of a depth camera do not take the images
+        metres = 0.0  # this baseline is between sensors of a depth camera
     return {"left": found[0], "right": found[-1], "baseline_mm": metres * MM_PER_M}
 
 
 def zed(values: Values, image: Pair) -> Values:
-    """Read ZED's SN.conf, which has sections by the size of the image, and the baseline in mm."""
+    """Read ZED's SN.conf, which has a section for each image size, and the baseline in mm."""
     sizes = {name: size for name, size in ZED_SIZES.items() if f"LEFT_CAM_{name}" in values}
     name = next((name for name, size in sizes.items() if image in (None, size)), None)
     if name is None:
         known = ", ".join(f"{width}x{height}" for width, height in sizes.values())
         raise ReconstructionError(
-            f"it has no section for this size of images, only for {known}: resize them"
+            f"it has no section for this size of images, only for {known}: resize the images"
         )
     both = (values[f"{side}_CAM_{name}"] for side in ("LEFT", "RIGHT"))
     left, right = ({**each, "resolution": sizes[name]} for each in both)
@@ -476,9 +476,9 @@ def meshroom(values: Values, image: Pair) -> Any:
 
 
 def metashape(values: Values, image: Pair) -> Any:
-    """Read Metashape's calibration, or its cameras of a chunk, both adjusted if there are two.
+    """Read Metashape's calibration, or the cameras of a chunk; adjusted ones are preferred.
 
-    Before version 1.2, PhotoScan had fx and fy, and counted cx and cy from the corner.
+    Before version 1.2, PhotoScan had fx and fy, and measured cx and cy from the corner.
     """
     cameras = []
     for _, each in objects_in(values):
@@ -497,14 +497,14 @@ def metashape(values: Values, image: Pair) -> Any:
 
 
 def bundler(values: Values, image: Pair) -> Any:
-    """Read a file of Bundler: f, k1, k2, rotation and translation; f is 0 without a pose."""
+    """Read a file of Bundler: f, k1, k2, rotation and translation; f is 0 if no pose is known."""
     count, _, *numbers = values["bundler"]
     rows = np.reshape(numbers[: 15 * int(count)], (-1, 15)).tolist()
     return [{"f": row[0], "coefficients": row[1:3]} for row in rows if row[0]]
 
 
 def nerfstudio(values: Values, image: Pair) -> Any:
-    """Read transforms.json of nerfstudio or instant-ngp, whose frames may have own cameras."""
+    """Read transforms.json of nerfstudio or instant-ngp, where each frame may have its camera."""
     cameras = []
     for frame in values.get("frames") or [{}]:
         own = {**values, **frame, "frames": ()}

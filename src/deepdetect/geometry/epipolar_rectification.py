@@ -1,7 +1,7 @@
 """Rectify two views by their fundamental matrix, so that epipolar lines become rows.
 
 `PlanarFrame` warps each view by a homography (Hartley, "Theory and practice of projective
-rectification", 1999). It suits cameras side by side. `PolarFrame` has one row for each direction
+rectification", 1999). This suits cameras side by side. `PolarFrame` has one row for each direction
 from the epipole (Pollefeys, Koch and Van Gool, "A simple and efficient rectification method for
 general motion", 1999). It also works if the epipole lies in the image. Its columns are spaced by
 the logarithm of the distance from the epipole, so that the magnification by a forward motion
@@ -142,7 +142,7 @@ class PolarFrame:
         first = np.column_stack([np.cos(angles), np.sin(angles)])
         if not view:
             return first
-        # All points in a direction have the same epipolar line as the point at infinity there.
+        # All points in a direction share the epipolar line of its point at infinity.
         lines = first @ self.fundamental[:, :2].T
         along = self.orientation * np.column_stack([lines[:, 1], -lines[:, 0]])
         return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)

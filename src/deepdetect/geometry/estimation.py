@@ -32,24 +32,24 @@ MAX_LOG10_NFA = -6.0
 
 MAX_ORDERS = 100
 """Matches are tried in at most this number of orders. OpenCV 5.0 raised an error for 20 of 1,600
-sets of 15 to 25 matches in a small region, and for the worst of these in 89 of 100 orders."""
+sets of 15 to 25 matches in a small region, and for the worst of these sets in 89 of 100 orders."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Number of matches that the minimal solver of each model needs."""
 
 MIN_PARALLAX_PX, MAX_EPIPOLE_DISTANCE_PX = 3.0, 1.5
-"""A match is off the plane if its transfer error under the homography is at least the first. It
-agrees with an epipole if it is closer than the second to the line from there to the position that
+"""A match is off the plane if its transfer error is at least MIN_PARALLAX_PX. It agrees with an
+epipole if it is within MAX_EPIPOLE_DISTANCE_PX of the line from the epipole to the position that
 the homography predicts. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_FRACTION_OF_PLANE, MIN_FRACTION_OF_REST = 0.2, 0.5
-"""Matches show that a scene has depth if those that agree on an epipole are at least the first
-fraction of those on the plane (moved objects give fewer) and the second of the others. Chosen like
-`MIN_PARALLAX_PX`."""
+"""A scene has depth if the matches that agree on an epipole number at least MIN_FRACTION_OF_PLANE
+of those on the plane (moved objects give fewer) and MIN_FRACTION_OF_REST of those off the plane.
+Chosen like `MIN_PARALLAX_PX`."""
 
 MAX_MATCHES, SAMPLES = 2000, 1000
-"""`measure_parallax` draws at most MAX_MATCHES matches off the plane, and SAMPLES epipoles, where
-the displacements of two of them from the plane intersect. Chosen by hand."""
+"""`measure_parallax` draws at most MAX_MATCHES matches off the plane, and SAMPLES epipoles, each
+the intersection of the displacement lines of two of these matches. Chosen by hand."""
 
 
 @suggest_keywords
@@ -234,9 +234,9 @@ def fit_shuffled(
 ) -> np.ndarray | None:
     """Fit a (3, 3) matrix to (M, 2) matches in a random order; return None if that fails.
 
-    OpenCV always draws the same samples, and the order makes them depend on the seed. For a few
-    samples of ordinary matches its MAGSAC raises an error, and `fit` gets another order. Degenerate
-    matches, such as coinciding points, raise none, but give no (3, 3) matrix.
+    OpenCV always draws the same samples; a random order makes them depend on the seed. If MAGSAC
+    raises an error, as it does for a few samples of ordinary matches, `fit` gets another order.
+    Degenerate matches, such as coinciding points, raise no error, but give no (3, 3) matrix.
     """
     random = np.random.default_rng(seed)
     for _ in range(MAX_ORDERS):
@@ -320,7 +320,7 @@ def log10_nfa(
     width, height = image_size
     if model == "homography":
         chance = pi * inlier_threshold**2 / (width * height)
-    else:  # area of a band along an epipolar line across the image
+    else:  # relative area of a band along an epipolar line
         chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
     agreeing = int(np.count_nonzero(inliers))
     sample_size = MINIMAL_SAMPLE_SIZE[model]
@@ -362,7 +362,7 @@ class Parallax:
         return self.log10_nfa < MAX_LOG10_NFA
 
     def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether `significant`, and `agreeing` is at least this fraction of `on_plane`."""
+        """Whether it is `significant`, and `agreeing` is at least this fraction of `on_plane`."""
         return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property

@@ -1,4 +1,4 @@
-"""Find the uniform frame of an image, and fill what is no part of the scene."""
+"""Find the uniform frame of an image, and fill pixels that are not part of the scene."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from .._shared.opencv import cv2
 
 MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
 MIN_SMOOTH_SHARE = 0.75
-"""Pixels of a frame differ from its colour by at most this number of grey levels in each channel,
-about what JPEG leaves; the first share of the outermost pixels is exactly equal. Each part
-covers the second share of the image, one row of 500. The scene covers the third share; a video in
-portrait format covers 0.32 of one in landscape format. The scene, or each part of the frame,
-reaches `MIN_SMOOTH_SHARE` of the outline of its convex hull, up to `FRAME_MARGIN_PX`: a scene may
-partly have the colour of the frame, but a skyline does not reach so much."""
+"""Pixels of a frame differ from its colour by at most MAX_FRAME_NOISE grey levels per channel,
+about the noise of JPEG. At least MIN_RING_SHARE of the outermost pixels are exactly equal. Each
+part of the frame covers at least MIN_FRAME_SHARE of the image (one row of 500), the scene
+MIN_SCENE_SHARE: a portrait video covers 0.32 of a landscape one. The scene, or each part of the
+frame, comes within FRAME_MARGIN_PX of MIN_SMOOTH_SHARE of the outline of its convex hull: a scene
+may partly have the frame's colour, but a skyline reaches less of the outline."""
 
 FRAME_MARGIN_PX = 8
 """Pixels up to this far from a frame or overlay belong to it, because keypoints there would show
@@ -22,10 +22,10 @@ its edge. JPEG spreads an edge over blocks of this side."""
 
 
 def uniform_frame(rgb: np.ndarray) -> np.ndarray:
-    """Return where a (H, W, 3) uint8 image is a uniform frame, (H, W) bool.
+    """Return the (H, W) bool mask of the uniform frame of a (H, W, 3) uint8 image.
 
-    A frame has one colour, reaches the border of the image, and ends in a smooth line: letter
-    boxes, corners of rotated or undistorted images, the surroundings of a round lens.
+    A frame has one colour, reaches the border of the image, and ends in a smooth line: letterbox
+    bars, corners of rotated or undistorted images, or the area around a circular fisheye image.
     """
     ring = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     values, counts = np.unique(ring @ np.array([65536, 256, 1]), return_counts=True)
@@ -53,7 +53,7 @@ def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
     if not (smooth and frame.any()):
         near = MAX_FRAME_NOISE // 4
         close = cv2.inRange(rgb, colour - near, colour + near) > 0
-        # Most of the parts is much closer to the colour than JPEG may leave it, unlike texture.
+        # Unlike texture, most of a frame is much closer to its colour than JPEG noise allows.
         if 2 * np.count_nonzero(close & np.isin(labels, parts)) < areas[parts].sum():
             return nowhere
         frame = np.isin(

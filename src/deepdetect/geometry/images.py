@@ -61,13 +61,13 @@ def warp_to_reference(
 def warp_visible(
     pixels: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Warp an image as `warp_to_reference` does, if it has transparent pixels, to RGB."""
+    """Warp an image, with transparent pixels or not, to RGB and a mask (`warp_to_reference`)."""
     warped, valid = warp_to_reference(continued(pixels), homography, size)
     return without_touched(warped, valid)
 
 
 def without_touched(warped: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return RGB of a warped image, and its mask without pixels that transparent ones touch."""
+    """Return a warped image as RGB, and its mask without pixels mixed with transparent ones."""
     if warped.shape[2] == 3:
         return warped, mask
     known = warped[:, :, 3] >= np.iinfo(warped.dtype).max * (1 - MAX_UNKNOWN_WEIGHT)
@@ -84,8 +84,8 @@ def warp_bands(
     """Warp an image of C bands, (H, W, C) of any type of number, as `warp_to_reference` does.
 
     A pixel has no data if any of its bands is `no_data` or NaN, or if it is `hidden`. Pixels of the
-    result that depend on such a pixel, or lie outside the image, become `no_data`. If that is None,
-    they become NaN if there are NaN, or else 0.
+    result that depend on such a pixel, or lie outside the image, become `no_data`. If `no_data` is
+    None, they become NaN if the image has NaN, or else 0.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:
@@ -191,8 +191,8 @@ def window_sums(
 ) -> np.ndarray:
     """Sum the values of sparse pixels over square windows, one sum for each window, (M,).
 
-    `pixels` are (N, 2) int64 (x, y), all different. `values` has one value for each of them, or is
-    one value for all. `shape` is that of the image, (H, W, ...). The windows are centred at the
+    `pixels` are (N, 2) int64 (x, y), all different. `values` has one value for each pixel, or is
+    one value for all. The image has the shape `shape`, (H, W, ...). The windows are centred at the
     (M, 2) pixels `at`, by default at `pixels`. The sums have the type of the values, or `dtype`.
     """
     image = _scatter(pixels, values, shape, dtype)

@@ -12,35 +12,35 @@ import numpy as np
 from .camera import Size
 
 DISTORTIONS = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3)
-"""Distortions that are tried: the part of its distance by which a lens moves a corner inwards. At 1
-it shows 180 degrees in the corners. An equidistant fisheye of 120 degrees has 0.4, one of 150
-degrees 0.65. These are as dense as the fits can tell them apart."""
+"""Distortions that are tried: the fraction of its radius by which the lens moves a corner inwards.
+At 1, the diagonal field of view is 180 degrees. An equidistant fisheye of 120 degrees has 0.4, one
+of 150 degrees 0.65. Fits cannot tell denser values apart."""
 
 MIN_DISTORTION, MIN_DEVIATIONS = 0.2, 6.0
-"""A lens with less distortion is no reason for an error: matches miss epipolar lines by few pixels.
-It fits better if the mean cost of the matches falls by this number of standard deviations (Vuong's
-test). The most for 201 pairs by pinholes are 4.3, of a street, and 1.9; fisheyes have up to 25."""
+"""Distortion below MIN_DISTORTION does no harm: matches miss epipolar lines by few pixels. A
+distorted model fits better if the mean cost of matches falls by MIN_DEVIATIONS standard deviations
+(Vuong's test). 201 pinhole pairs have at most 4.3 (a street) and 1.9, fisheyes up to 25."""
 
 MIN_FLAT_DEVIATIONS, MIN_FLAT_RATIO, NEAR = 15.0, 2 / 3, 3.0
-"""A distorted homography fits a plane or a camera that turned better by this number of deviations,
-and fits at least this fraction of the matches that fit a pinhole's epipolar lines, within NEAR
-times `SCALE`. A curved cloth has 8 and 0.55; the fisheyes found have 20 to 70 and 0.7 to 0.9."""
+"""A distorted homography of a plane or a turned camera must fit better by MIN_FLAT_DEVIATIONS, and
+fit MIN_FLAT_RATIO times as many matches, within NEAR times `SCALE`, as a pinhole's epipolar lines.
+A curved cloth has 8 and 0.55; the fisheyes found have 20 to 70 and 0.7 to 0.9."""
 
 MIN_MATCHES = 30
-"""No distortion is sought in fewer matches, because one may fit them by chance."""
+"""Distortion is not estimated from fewer matches, because it may fit them by chance."""
 
 UNDISTORT = "undistort them with the lens's calibration (cv2.undistort, cv2.fisheye)"
 
 SCALE = 1e-3
 SCALES = SCALE * np.array([16.0, 8, 4, 2, 1, 1, 1, 1, 1])
-"""Scales of the Cauchy loss of successive fits, in half diagonals: the last is about one pixel of
-images with 1200 columns. Wide scales first find a fit that is wrong at the border only."""
+"""Scales of the Cauchy loss of successive fits, in half image diagonals; the last is about a pixel
+of images with 1200 columns. The wide ones first find a fit that is wrong only at the border."""
 
 
 def deviations(costs0: np.ndarray, costs1: np.ndarray) -> float:
     """Return by how many standard deviations the second model fits better (Vuong's test).
 
-    Both are (N,) costs of the same observations, under two models with equally many parameters.
+    The (N,) costs are of the same observations, under two models with equally many parameters.
     """
     falls = costs0 - costs1
     return float(falls.mean() / max(falls.std(), 1e-12) * np.sqrt(len(falls)))
@@ -49,9 +49,9 @@ def deviations(costs0: np.ndarray, costs1: np.ndarray) -> float:
 def distortion(
     points0: np.ndarray, points1: np.ndarray, agreeing: np.ndarray, sizes: tuple[Size, Size]
 ) -> float:
-    """Return one of `DISTORTIONS` that fits (M, 2) matches clearly better than none, otherwise 0.
+    """Return the distortion in `DISTORTIONS` that fits matches clearly better than none, or else 0.
 
-    Many matches may be wrong; `agreeing` is (M,) bool, true for those with a pinhole geometry.
+    Many of the (M, 2) matches may be wrong; `agreeing`, (M,) bool, are inliers of a pinhole model.
     """
     if len(points0) < MIN_MATCHES:
         return 0.0
@@ -71,20 +71,20 @@ def distortion(
 def _compared(
     xy: list[np.ndarray], agreeing: np.ndarray, flat: bool, least: float
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the distortion that fits better by `least` deviations, or 0, and costs without, with.
+    """Return a distortion that fits better by `least` deviations, or 0; costs without and with it.
 
-    `xy` are the positions from the middle of the image, in half diagonals.
+    `xy` are positions relative to the middle of the image, in half diagonals.
     """
     straight = _costs(xy, 0.0, agreeing, SCALES, flat)
     bent = [_costs(xy, each, agreeing, SCALES, flat) for each in DISTORTIONS]
     best = int(np.argmin([costs.sum() for costs in bent]))
     if DISTORTIONS[best] < MIN_DISTORTION or deviations(straight, bent[best]) < least:
         return 0.0, straight, bent[best]
-    for costs in bent:  # a pinhole may also fit, but only from where these fits have led
+    for costs in bent:  # a pinhole may fit as well, starting from the weights of these fits
         for scales in (SCALES[1:], SCALES[4:]):
             again = _costs(xy, 0.0, np.exp(-costs), scales, flat)
             straight = min(straight, again, key=np.sum)
-    # Something that moves by itself gets a fit of its own, so that it does not pass for a lens.
+    # A moving object gets a fit of its own, so that it is not mistaken for lens distortion.
     several = [
         np.minimum(costs, _costs(xy, each, 1 - np.exp(-costs), SCALES, flat))
         for costs, each in ((straight, 0.0), (bent[best], DISTORTIONS[best]))
@@ -96,7 +96,7 @@ def _compared(
 def _costs(
     xy: list[np.ndarray], distortion: float, weights: np.ndarray, scales: np.ndarray, flat: bool
 ) -> np.ndarray:
-    """Fit a constraint by iterated reweighting; return the (M,) costs at the scale `SCALE`."""
+    """Fit a constraint by iteratively reweighted least squares; return (M,) costs at `SCALE`."""
     first, second = (np.column_stack([p, 1 - distortion * (p**2).sum(axis=1)]) for p in xy)
     products = second[:, :, None] * first[:, None, :]
     if flat:  # second is parallel to H first
@@ -123,7 +123,7 @@ def _costs(
 
 
 def _distorted(rays: np.ndarray, distortion: float) -> np.ndarray:
-    """Return where (N, 3) rays are seen: the inverse of (x, y, 1 - distortion * r^2)."""
+    """Project (N, 3) rays and distort them: the inverse of (x, y, 1 - distortion * r^2)."""
     ahead, side = rays[:, 2:], np.linalg.norm(rays[:, :2], axis=1, keepdims=True) + 1e-12
     root = np.sqrt(ahead**2 + 4 * distortion * side**2)
     return np.asarray(rays[:, :2] * 2 / np.maximum(ahead + root, 1e-6))

@@ -15,14 +15,14 @@ UNITS = {
     "baseline": "baselines (1 = the distance between the two cameras)",
     "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
 }
-"""Units of length, and their description in files. The last two have no metric scale."""
+"""Units of length, and their descriptions in files. "baseline" and "spacing" are not metric."""
 
 EAST_NORTH_UP = "x east, y north, z up"
 """`PointCloud.frame` of a georeferenced cloud. Any other value is the name of a camera."""
 
 BOX_PERCENTILE, MAX_ANGULAR_SPACING = 1.0, 0.02
-"""This percentage of the points lies beyond each face of the robust box. The maximum of
-`angular_spacing`, in radians, limits the size of drawn points. Chosen by hand."""
+"""BOX_PERCENTILE percent of the points lie beyond each face of the robust box. MAX_ANGULAR_SPACING,
+the maximum of `angular_spacing` in radians, limits the size of drawn points. Chosen by hand."""
 
 
 @suggest_keywords
@@ -36,7 +36,7 @@ class PointCloud:
         colors: (N, 3) uint8 sRGB.
         unit: "mm", "m", "baseline" (the distance between the two cameras) or "spacing" (the median
             distance from one of many cameras to the nearest other).
-        frame: name of the camera whose frame it is, or `EAST_NORTH_UP`.
+        frame: name of the camera in whose frame the points are, or `EAST_NORTH_UP`.
         normals: (N, 3) float32 unit vectors, which point towards the cameras, or None.
 
     A cloud has a `len`, and can be indexed by slices, masks and index arrays.
@@ -124,7 +124,7 @@ class RobustBox:
 def robust_box(cloud: PointCloud) -> RobustBox:
     """Find the box from the 1st to the 99th percentile of each coordinate.
 
-    A few distant outliers hardly change it. An empty cloud raises an OptionError.
+    A few distant outliers hardly change the box. An empty cloud raises an OptionError.
     """
     require_points(cloud)
     ends = BOX_PERCENTILE, 100 - BOX_PERCENTILE

@@ -20,12 +20,12 @@ BLOCK, MAX_MATCHES = 100_000, 50_000
 fitted to at most MAX_MATCHES, because more do not improve it."""
 
 MAX_ITERATIONS, DERIVATIVE_STEP, MIN_CHANGE = 10, 1e-6, 1e-9
-"""Gauss-Newton stops after so many steps, or when none of the five angles changes by more than
-MIN_CHANGE. Numerical derivatives vary each by DERIVATIVE_STEP (both in radians)."""
+"""Gauss-Newton stops after MAX_ITERATIONS steps, or when no angle changes by more than MIN_CHANGE.
+Numerical derivatives vary each of the five angles by DERIVATIVE_STEP. Both are in radians."""
 
 MAX_REFITS, MIN_INLIER_GAIN = 4, 0.01
-"""A pose is refitted to its inliers at most so often, while their number grows by more than the
-fraction MIN_INLIER_GAIN. Chosen by hand."""
+"""A pose is refitted to its inliers at most MAX_REFITS times, while their number grows by more than
+the fraction MIN_INLIER_GAIN. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate (N, 2) matches in pixels; the pose is X1 = rotation @ X0 + translation.
 
-    `correct_matches` first makes the two rays meet: the maximum likelihood for equal noise.
+    First, `correct_matches` makes the two rays of each match meet (maximum likelihood).
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -124,7 +124,7 @@ class RelativePose:
         inliers: (M,) bool, True for matches with an error below the threshold.
         errors: (M,) float64 Sampson distances of all matches in pixels.
         cheirality_ratio: fraction of the inliers that lie in front of both cameras, in [0, 1].
-        left_out: share of the image that `estimate_pose` left out, because it stands still.
+        left_out: fraction of the image that `estimate_pose` left out, because it stays in place.
     """
 
     rotation: np.ndarray
@@ -249,7 +249,7 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def best_of_four(
     essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of an essential matrix with the most points in front of both cameras."""
+    """Return the best pose of an essential matrix: most points lie in front of both cameras."""
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
     points0, points1 = _evenly(points0), _evenly(points1)
     poses = [

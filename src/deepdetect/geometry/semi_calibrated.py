@@ -1,9 +1,9 @@
 """Estimate the fundamental matrix of two ordinary cameras whose focal length is not known.
 
-Most pairs have square pixels, principal points near the middle, and similar focal lengths. RANSAC
-is run for each of a few focal lengths: samples of five matches, not seven as for a fundamental
-matrix, are more often free of wrong ones. Pose and cameras are then fitted together to the inliers
-of the focal length with the best evidence.
+Most pairs have square pixels, principal points near the middle, and similar focal lengths. For each
+of a few focal lengths, RANSAC estimates an essential matrix, because samples of five matches
+instead of seven are more often free of outliers. For the focal length with the best evidence, the
+relative pose and the cameras are then fitted together to the inliers.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from .similarity import MAD_STD
 from .transforms import epipolar_errors, signed_epipolar_errors
 
 MIN_MATCHES, MODELS_PER_SAMPLE = 6, 10
-"""An essential matrix needs five matches, which up to ten fit, and a sixth one to test it."""
+"""Five matches fit up to MODELS_PER_SAMPLE essential matrices; a sixth match tests them."""
 
 FOCAL_LENGTHS, START_FOCAL_LENGTHS = (0.7, 1.4), np.geomspace(0.4, 2.5, 12)
-"""Focal lengths in units of the longer side of the image. RANSAC is run with each of the first, as
-good as a dense range from 90 to 28 degrees. A fit to a fundamental matrix starts from the one of
-the second, chosen by hand, that makes it most nearly essential."""
+"""Focal lengths in units of the image's longer side. RANSAC is run with each of FOCAL_LENGTHS, as
+good as a dense range from 90 to 28 degrees of view. The refinement of a fundamental matrix starts
+from the one of START_FOCAL_LENGTHS, chosen by hand, that makes the matrix most nearly essential."""
 
 CONFIDENCE, ITERATIONS = 0.9999, 5000
-"""RANSAC stops when at least one sample was free of outliers with this probability, and after so
-many samples for each focal length. Chosen by hand."""
+"""RANSAC stops when, with the probability CONFIDENCE, a sample was free of outliers, or after
+ITERATIONS samples for each focal length. Chosen by hand."""
 
 FOCAL_SPREAD, FOCAL_DIFFERENCE, PRINCIPAL_POINT_SPREAD = 0.7, 0.03, 0.03
-"""Prior standard deviations, in units of the longer side of the image: of the mean logarithm of the
-focal lengths from 0, of their difference, and of cx and cy from the middle. Chosen by hand."""
+"""Prior standard deviations, in units of the image's longer side: of the mean log focal length from
+0, of the difference of both log focal lengths, and of cx and cy from the middle. Chosen by hand."""
 
 MATCH_SIGMA_PX = 0.5
-"""Standard deviation of correct matches from their epipolar lines. Chosen by hand."""
+"""Standard deviation of the distance of correct matches to epipolar lines. Chosen by hand."""
 
 MIN_SIGMA_PX = 0.1
-"""Minimum assumed standard deviation of the errors of matches of one source. Chosen by hand."""
+"""Minimum standard deviation of match errors in `refine_fundamental`. Chosen by hand."""
 
 MAX_FITS, MAX_ITERATIONS = 4, 20
-"""Pose and cameras are fitted to the inliers at most so often, each time with at most so many steps
-of Levenberg-Marquardt. Chosen by hand."""
+"""Pose and cameras are fitted to the inliers at most MAX_FITS times, each time with at most
+MAX_ITERATIONS steps of Levenberg-Marquardt. Chosen by hand."""
 
 
 def estimate_semi_calibrated(
@@ -105,10 +105,10 @@ def refine_fundamental(
     fundamental: np.ndarray,
     sizes: tuple[Size, Size],
 ) -> np.ndarray:
-    """Refine a fundamental matrix by matches, most of them correct, and a prior on the cameras.
+    """Refine a fundamental matrix by mostly correct matches and a prior on the two cameras.
 
-    Each source has (M, 2) positions in both images, which its median error weights. The result has
-    norm 1; fewer than six matches change nothing.
+    Each source has (M, 2) positions in both images; its median error sets the weight of its
+    matches. The result has norm 1. With fewer than six matches, the matrix is returned as it is.
     """
     points0, points1 = (np.concatenate([each[side] for each in sources]) for side in (0, 1))
     if len(points0) < MIN_MATCHES:

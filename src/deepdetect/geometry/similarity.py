@@ -28,10 +28,10 @@ this angle, because three points that lie nearly on a line can give any tilt."""
 MIN_AREA_POINTS, MIN_AREA, MUCH_BETTER = 8, 0.2, 0.5
 """Points can overrule the known upward direction only if there are MIN_AREA_POINTS, their second
 principal axis is above MIN_AREA times as long as the first, and the median distance from the
-targets falls below MUCH_BETTER of what it was. Chosen by hand."""
+targets is below MUCH_BETTER of that with the upward direction. Chosen by hand."""
 
 HUBER_STDS, WRONG_STDS = 2.0, 5.0
-"""Residuals above these numbers of standard deviations get less weight, or none. Chosen by hand."""
+"""Residuals get less weight above HUBER_STDS sigmas, none above WRONG_STDS. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
 """The stated accuracy of the targets counts as much as this number of residuals, because a few
@@ -65,8 +65,8 @@ class SimilarityFit:
         residuals: (N, 3) targets minus transformed points, NaN where the target is unknown.
         wrong: (N,) bool, True for points that do not agree with the others.
         scale_std: relative standard deviation of the scale; 0 if the scale was given.
-        axes_std_deg: (3,) of the rotation about the x, y and z axes of the targets, in degrees.
-        axis_std_deg_of_targets: that about its least certain axis without `level`; at most 180.
+        axes_std_deg: (3,) standard deviations of the rotation about the targets' axes, in degrees.
+        axis_std_deg_of_targets: the same about the least certain axis without `level`; at most 180.
     """
 
     similarity: Similarity
@@ -94,8 +94,8 @@ def fit_similarity(
         targets: (N, 3) positions of the same points, z up; z may be NaN where it is unknown.
         accuracy: expected standard deviation of the targets.
         up: (3,) approximate upward direction in the frame of the points.
-        level, level_stds: (L, 3) horizontal directions there, and their (L,) standard deviations
-            in radians.
+        level, level_stds: (L, 3) horizontal directions in the frame of the points, and their (L,)
+            standard deviations in radians.
         scale: the scale, if it is known.
 
     Raises:
@@ -108,7 +108,7 @@ def fit_similarity(
     found = _search(points, targets, known, up, scale)
     if found is None:
         raise ReconstructionError("the points are in one place")
-    middle = points.mean(axis=0)  # rotation and scale about this point keep the translation
+    middle = points.mean(axis=0)  # rotation and scaling about it do not change the translation
     own, free = points - middle, 7 if scale is None else 6
     current = Similarity(found.scale, found.rotation, found.apply(middle[None])[0])
     distances = np.linalg.norm((targets - current.apply(own)) * known, axis=1)
@@ -126,7 +126,7 @@ def fit_similarity(
         weighted = jacobian * weights[:, None, None]
         of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
         right = np.einsum("nai,na->i", weighted, residuals / stds)
-        # Level directions should have z = 0. Others get less weight, as some images are tilted.
+        # Horizontal directions should have z = 0; tilted images make z larger and get less weight.
         seen = level @ current.rotation.T
         errors = seen[:, 2] / level_stds
         rows = np.zeros((len(level), 7))
@@ -158,7 +158,7 @@ def fit_similarity(
 
 
 def changes(points: np.ndarray) -> np.ndarray:
-    """Return how points (N, 3) change (N, 3, 7) by a shift, a small rotation and a small scale."""
+    """Return the (N, 3, 7) derivatives of (N, 3) points by translation, rotation and log scale."""
     moves = np.tile(np.eye(3), (len(points), 1, 1))
     turns = np.reshape([-cross_matrix(row) for row in points], (-1, 3, 3))
     return np.concatenate([moves, turns, points[:, :, None]], axis=2)
@@ -224,7 +224,7 @@ def least_squares_similarity(
 def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.ndarray:
     """Return the (3,) standard deviations of the targets; those of x and y are the same."""
     stds = []
-    for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: number of fitted parameters
+    for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: number of parameters fitted to them
         values = np.abs(residuals[:, axes][known[:, axes]])
         squares = len(values) * (MAD_STD * np.median(values)) ** 2 if len(values) else 0.0
         free = PRIOR_COUNT + max(len(values) - lost, 0)

@@ -1,4 +1,4 @@
-"""Tell from matches what two images show: a plane, a rotation, or the same view."""
+"""Decide from matches whether two images show a plane, a pure rotation, or the same view."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
 accurate keypoints, from reduced copies of the images."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
-"""Inlier thresholds in pixels of the models by which a rectified pair or a turn of the camera is
+"""Inlier thresholds in pixels of the models by which a rectified pair or a pure rotation is
 recognised. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_PLANAR_RATIO = 0.75
@@ -28,8 +28,8 @@ MIN_PLANAR_RATIO = 0.75
 the fundamental matrix. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MAX_MEDIAN_MOTION_PX, MAX_MOTION_PX, MOTION_QUANTILE = 0.5, 3.0, 0.9
-"""Two images show the same view only if the median of the distances that matches move is below the
-first, and their MOTION_QUANTILE below the second. Chosen like `SCENE_THRESHOLDS_PX`."""
+"""Two images show the same view only if the median motion of matches is below MAX_MEDIAN_MOTION_PX,
+and their MOTION_QUANTILE below MAX_MOTION_PX. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 
 def fit_model(
@@ -56,7 +56,7 @@ def is_planar(
     epipolar: TwoViewModel,
     seed: int = 0,
 ) -> bool:
-    """Return whether the homography `plane` explains the correct ones among (M, 2) matches."""
+    """Return whether the homography `plane` explains the correct matches among (M, 2) matches."""
     least = MIN_PLANAR_RATIO * np.count_nonzero(epipolar.inliers)
     if plane.matrix is None or np.count_nonzero(plane.inliers) < least:
         return False
@@ -66,7 +66,7 @@ def is_planar(
 
 
 def is_static(motion_px: np.ndarray) -> bool:
-    """Return whether two images show the same view, given the distances that matches move."""
+    """Return whether two images show the same view, given how far matches move, in pixels."""
     motion = np.abs(motion_px)
     return bool(
         np.median(motion) < MAX_MEDIAN_MOTION_PX

@@ -108,7 +108,7 @@ class DeepDetectMatcher(BaseModel):
     The options `ratio` and `mutual` are those of `match_features`. The matcher accepts descriptors
     of any extractor, if they are compared by Euclidean distance. If `descriptor` is "learned", the
     features must be those of `DeepDetectExtractor` with angles in degrees. The matcher then finds
-    more matches, because it takes the rotation between the images into account.
+    more matches, because it undoes the rotation between the images.
     """
 
     default_conf: dict[str, Any] = {  # noqa: RUF012
@@ -157,8 +157,8 @@ class DeepDetectMatcher(BaseModel):
 class DeepDetectDenseMatcher(BaseModel):
     """Dense guided matcher of two images, for `hloc.match_dense`.
 
-    If the option `max_keypoints` is set, it uses a `PointDetector`, otherwise a `DeepDetect` with
-    the option `weights`. If no geometry can be trusted, it returns no matches.
+    If the option `max_keypoints` is set, the matcher uses a `PointDetector`, otherwise a
+    `DeepDetect` with the option `weights`. If no geometry can be trusted, it returns no matches.
     """
 
     default_conf: dict[str, Any] = {"weights": "default", "max_keypoints": None}  # noqa: RUF012

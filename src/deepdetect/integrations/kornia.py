@@ -18,7 +18,7 @@ from torch.nn import Module
 
 LAF_SCALE_PER_SIZE = 3.0
 """Ratio of the scale of a local affine frame (LAF) to the keypoint's diameter, which is 2 sigma.
-The scale is half the side of the described patch, and 6 sigma as in SIFT."""
+The scale, 6 sigma as in SIFT, is half the side of the described patch."""
 
 
 class DeepDetectDetector(Module):
@@ -93,7 +93,7 @@ class DeepDetectFeature(DeepDetectDetector):
         descriptors = [
             unit_length(points.descriptors)
             for points in found
-            if points.descriptors is not None  # always
+            if points.descriptors is not None  # always true
         ]
         return *self._frames(found, img), padded(descriptors, img.device)
 

@@ -1,4 +1,4 @@
-"""LightGlue: an extractor that replaces its SIFT extractor.
+"""LightGlue: an extractor that replaces LightGlue's own SIFT extractor.
 
 The features suit `LightGlue(features="sift")` of the packages lightglue and kornia. The weights of
 LightGlue are not part of DeepDetect, and have licences of their own.

@@ -133,7 +133,7 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def check_upright(paths: Iterable[Path]) -> None:
-    """Raise an OptionError for a readable image that EXIF rotates, because hloc ignores EXIF."""
+    """Raise an OptionError for an image with an EXIF rotation, because hloc ignores EXIF."""
     for path in paths:
         try:
             with open_image(path) as image:

@@ -34,12 +34,12 @@ def write_colmap(
     intrinsics: Mapping[str, CameraIntrinsics],
     verify: bool = True,
 ) -> tuple[Path, ...]:
-    """Write a COLMAP database, complete or not at all; an existing file is replaced.
+    """Write a COLMAP database atomically; an existing file is replaced.
 
     Args:
         collection: the images.
         output: path that ends in .db.
-        intrinsics: camera of each image, by name. Images with the same object share a camera.
+        intrinsics: camera of each image, by image name. Images with the same object share a camera.
         verify: estimate the two-view geometry of each pair, which COLMAP's mapper needs.
 
     Returns:

@@ -21,11 +21,11 @@ FILES = ("features.h5", "matches.h5", "pairs.txt")
 def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
     """Write features.h5 (keypoints, scores and descriptors), matches.h5 and pairs.txt.
 
-    The three files are arguments of `hloc.reconstruction.main`. Each file appears complete or not
-    at all. The descriptors of an image have the shape (D, N).
+    The three files are arguments of `hloc.reconstruction.main`. Each file is written atomically.
+    The descriptors of an image have the shape (D, N).
 
     Args:
-        collection: the images; hloc needs descriptors for matching, not for mapping.
+        collection: the images, whose descriptors hloc needs for matching, but not for mapping.
         output: folder for the files.
 
     Returns:

@@ -41,10 +41,9 @@ def read_collection(
         files: one HDF5 file written by `deepdetect extract` or hloc; or npz files written by
             `deepdetect detect` (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz).
         matches: HDF5 file written by `deepdetect match-many` or hloc.
-        images: folder of the images, in which images that npz files name by stems are looked up.
+        images: folder of the images, in which the image of each npz file is looked up by its stem.
 
-    Returns:
-        The collection. Matches from npz files are only the inliers of the geometry, and join
+    Returns: The collection. Matches from npz files are only the inliers of the geometry. They link
         keypoints, not refined positions, so that matches of several pairs form tracks.
 
     Raises:
@@ -156,8 +155,8 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
             before = keypoints.setdefault(name, own)
             if not (np.array_equal(before.xy, own.xy) and before.image_size == own.image_size):
                 raise InvalidFileError(
-                    f"{path} has other keypoints of {name} than the other files: write all with "
-                    "the same options"
+                    f"{path} has other keypoints of {name} than the other files: write all "
+                    "files with the same options"
                 )
         kept = loaded.inliers
         rows = np.column_stack([loaded.indices0[kept], loaded.indices1[kept]])
@@ -182,7 +181,7 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
 
 
 def _name_of(path: Path, names: Mapping[str, str]) -> str:
-    """Return the image name of the longest end of an npz file's path that is a key of `names`."""
+    """Return the image name for the longest trailing part of an npz file's path in `names`."""
     parts = path.with_suffix("").parts
     for first in range(len(parts)):
         if (key := "/".join(parts[first:])) in names:
@@ -246,7 +245,7 @@ def match_folder(
             "'sequential:10'"
         )
     pairs = "exhaustive" if pairs is None else pairs
-    list_pairs(pairs, ())  # raises an error for wrong pairs before long work
+    list_pairs(pairs, ())  # wrong pairs raise an error before the long work
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
         features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")
         extracted = extract_features(root, features, detector, workers=workers, quiet=quiet)
@@ -254,7 +253,7 @@ def match_folder(
             extracted.check()
         keypoints = read_features_file(features)
         unread = set(names) - keypoints.keys()
-        # An unreadable image counts as one failure; its pairs are not further failures.
+        # An unreadable image counts as one failure; the pairs with it are not counted.
         wanted = list_pairs(pairs, [name for name in names if name in keypoints])
         wanted = [pair for pair in wanted if unread.isdisjoint(pair)]
         matched = match_pairs(features, wanted, found, workers=workers, quiet=quiet)

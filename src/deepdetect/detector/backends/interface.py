@@ -82,7 +82,7 @@ def unreadable(path: Path, error: Exception) -> WeightsError:
 
 
 def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
-    """Return the error for a failed run on (N, 3, H, W): a MemoryError if memory was short."""
+    """Return the error for a failed run on images of a shape: a MemoryError if memory was short."""
     if any(word in f"{type(error).__name__} {error}" for word in ("MemoryError", "alloc")):
         return MemoryError(str(error))
     height, width = image_shape[2:]
@@ -93,6 +93,6 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
 
 
 def _reason(error: Exception) -> str:
-    """Return the line of an engine's error message that gives the reason: OpenVINO's last one."""
+    """Return the line of a runtime's error message that gives the reason: the last for OpenVINO."""
     reason = first_line(error)
     return str(error).strip().splitlines()[-1] if reason.startswith("Exception from") else reason

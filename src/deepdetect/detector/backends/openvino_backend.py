@@ -50,7 +50,7 @@ class OpenVinoNetwork:
             model = self._model
             if model is None:
                 model = self._model = self._compile()
-            request = model.create_infer_request()  # one per call, as threads may run at once
+            request = model.create_infer_request()  # one per call, for concurrent threads
             output = request.infer([image], share_inputs=True)[self._output_name]
             # If memory is short, OpenVINO may also return nothing, or the previous image's map.
             if self._works and output.shape[2:] != image.shape[2:]:

@@ -29,7 +29,7 @@ BACKENDS: dict[str, Callable[[Path, RuntimeOptions], Network]] = {
     "onnxruntime": open_onnxruntime,
     "openvino": open_openvino,
 }
-"""The function of each backend that opens a file. Backends are named after Python packages."""
+"""Functions that open a weights file, by backend. Backends are named after Python packages."""
 
 PRECISIONS = ("float32", "bfloat16")
 
@@ -54,7 +54,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
         value = getattr(options, option)
         if value != usual and name != needed:
             raise OptionError(
-                f'`{option}="{value}"` needs the backend {needed}, not {name}: leave out one'
+                f'`{option}="{value}"` needs the backend {needed}, not {name}: leave one out'
             )
     require_packages(f"reading {path.name} with the backend {name}", name)
     file = path.stat()

@@ -56,7 +56,7 @@ def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
 
     written = {**METADATA, "version": __version__, **values}
     helper.set_model_props(model, dict(sorted(written.items())))
-    # Only in files with this producer name does OpenCV 4 average correctly at the border.
+    # OpenCV 4 averages correctly at the border only in files with this producer name.
     model.producer_name = "pytorch"
     model.graph.name = "deepdetect"
 
@@ -108,7 +108,7 @@ def rename(node: NodeProto, old: str, new: str) -> None:
 
 
 def add_constants(graph: GraphProto, values: Mapping[str, Any], kind: type = np.int64) -> None:
-    """Add small constants, replacing those of the same name."""
+    """Add small constants to a graph, and replace constants of the same name."""
     from onnx import numpy_helper
 
     others = [one for one in graph.initializer if one.name not in values]

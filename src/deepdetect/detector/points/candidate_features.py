@@ -30,7 +30,7 @@ def ring_offsets() -> np.ndarray:
     """
     angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
     reach = SIGMAS_PX[:, None, None, None] * RING_RADII
-    odd = np.arange(2)[:, None, None]  # rounds halves to even columns and rows
+    odd = np.arange(2)[:, None, None]  # halves are rounded to even columns and rows
     rings = [np.rint(reach * turn(angle) + odd) - odd for turn in (np.cos, np.sin)]
     return np.array(rings, np.int64).reshape(2, len(SIGMAS_PX), 2, -1)
 
@@ -38,13 +38,13 @@ def ring_offsets() -> np.ndarray:
 def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
     """Compute the (N, `FEATURES`) float32 features of candidates.
 
-    The first is the scaled logarithm of |det Hessian|. The others are, in this order:
-    - |det Hessian| at three neighbouring levels (one finer, two coarser), relative to the first;
+    The first feature is the scaled logarithm of |det Hessian|. The others are, in this order:
+    - |det Hessian| one level finer and one and two levels coarser, relative to the candidate's own;
     - the sign of det Hessian, which tells blobs from saddles;
-    - the trace of the Hessian with and without its sign, at these and the candidate's own level;
+    - the trace of the Hessian with and without its sign, at these levels and the candidate's own;
     - the squared gradient at the same four levels;
-    - the grey value;
-    - the largest |det Hessian| nearby at the three levels, relative to the value at the pixel;
+    - the grey value at the candidate's level;
+    - the largest |det Hessian| nearby at the three levels, relative to that at the candidate;
     - for each ring, mean, maximum and minimum of |det Hessian| and of the grey value, and mean and
       maximum of the squared gradient;
     - the rank by |det Hessian|, divided by the number of pixels, and the level.

@@ -49,10 +49,10 @@ def describe_learned(
     """Return keypoints with learned descriptors at their own sizes and angles.
 
     `gray` is the (H, W) uint8 luma of the image, possibly scaled down. Angles that are missing or
-    -1 are replaced by the dominant gradient orientations; those of "cross-modal" descriptors are
-    always the orientations of `edge_strength`, which they describe in place of the luma.
-    `descriptor` is a name in `DESCRIPTOR_GRAPHS`, or a similar ONNX file. Keypoints without sizes
-    raise an OptionError.
+    -1 are replaced by the dominant gradient orientations. For "cross-modal", `edge_strength`
+    replaces the luma, and all angles are replaced by its dominant orientations. `descriptor` is a
+    name in `DESCRIPTOR_GRAPHS`, or a similar ONNX file. Keypoints without sizes raise an
+    OptionError.
     """
     kind = descriptor_type(descriptor)
     if not len(keypoints):
@@ -89,7 +89,7 @@ def descriptor_type(descriptor: str | Path) -> str:
         return str(descriptor)
     path = resolve_weights(descriptor)
     digest = file_digest(path)[:DIGEST_LENGTH]
-    _session(path, digest, thread_limit())  # raises an error if it is not a descriptor's
+    _session(path, digest, thread_limit())  # raises an error if the file is no descriptor
     return f"{LEARNED}-{digest}"
 
 

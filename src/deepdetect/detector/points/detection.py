@@ -24,9 +24,9 @@ SPREADS = ("none", "grid", "anms")
 
 CANDIDATES_PER_KEYPOINT, MIN_CANDIDATES = 6, 8192
 """The ranker gets the candidates with the highest |det Hessian|: `CANDIDATES_PER_KEYPOINT` for each
-wanted keypoint, but at least `MIN_CANDIDATES` in all. It gets every candidate if all keypoints are
-wanted, or if keypoints are spread. Three candidates per keypoint would save 7 of 56 ms at 640x480,
-but would lower repeatability (within 3 px) by 0.01."""
+wanted keypoint, but at least `MIN_CANDIDATES` in all. The ranker gets every candidate if all
+keypoints are wanted, or if keypoints are spread. Three candidates per keypoint would save 7 of 56
+ms at 640x480, but would lower repeatability (within 3 px) by 0.01."""
 
 TILE_PX = 32
 """Candidates are processed in square tiles of this side, which fit in the cache. Chosen by hand."""
@@ -35,9 +35,9 @@ GRID_CELLS = 16
 """Number of grid cells along the longer side of the image if `spread` is "grid". Chosen by hand."""
 
 DISTANCE_PX, DISTANCE_PER_SIGMA = 2.0, 1.0
-"""Minimum distances of two keypoints: 1.5 or 2.3 px change the ranker's score by less than 0.003.
-The second, in sigmas of the smaller keypoint, keeps structures from being found at several scales,
-and raised the score on photos/val from 0.539 to 0.543."""
+"""Keypoints are at least DISTANCE_PX apart; 1.5 or 2.3 px change the ranker's score by less than
+0.003. They are also DISTANCE_PER_SIGMA sigmas of the smaller keypoint apart, so that no structure
+is found at several scales, which raised the score on photos/val from 0.539 to 0.543."""
 
 SIZE_PER_SIGMA = 2.5
 """Diameter at which a keypoint is described, divided by the sigma of its scale. Chosen by hand."""
@@ -70,7 +70,7 @@ def detect_points(
         return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none, angles=none)
     radii = least_distances(candidates.sigma_px)
     kept = suppress_neighbors(candidates.xy, logits, radii, limit)
-    if max_keypoints is not None and len(kept) > max_keypoints:  # the limit is None: to be spread
+    if max_keypoints is not None and len(kept) > max_keypoints:  # keypoints are to be spread
         found = candidates.xy[kept], logits[kept]
         if spread == "grid":
             chosen = spread_over_grid(*found, size, max_keypoints, GRID_CELLS)
@@ -104,7 +104,7 @@ def rank_candidates(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
     rows = rows[:strongest]
-    # Sorted by tiles, successive candidates of all scales use the same pixels in the cache.
+    # In the order of tiles, successive candidates of all scales use the same cached pixels.
     tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
     candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
     return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))

@@ -10,11 +10,11 @@ from ..._shared.opencv import cv2
 from ...features.selection import descending_order, peak_offset
 
 NMS_RADIUS = 2
-"""A candidate is the maximum of its level within this many pixels in x and y. Chosen by hand."""
+"""A candidate has the highest |det Hessian| within this many pixels in x and y. Chosen by hand."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
 """Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Seven levels have
-candidates. The finest and the two coarsest only serve the features for ranking. Chosen by hand."""
+candidates. The finest and the two coarsest only serve the ranker's features. Chosen by hand."""
 
 VARIANCES = (SIGMAS_PX**2).astype(np.float32)
 """Squares of `SIGMAS_PX`, which normalise the derivatives."""

@@ -78,7 +78,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
     places, right, down = steps[0], steps[1], steps[2]
     response, slope, light = values[0], values[1], values[2]
     # `logs` holds |det Hessian| at the candidate and at three neighbouring scales, the maxima of
-    # |det Hessian| nearby at these three, squared gradients at four scales, and ring values.
+    # |det Hessian| nearby at these three scales, squared gradients at all four, and ring values.
     logs, bent = np.empty(11 + 7 * RINGS, np.float32), np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
         level, row, column = candidates[n, 0], candidates[n, 1], candidates[n, 2]

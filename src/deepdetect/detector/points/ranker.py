@@ -1,4 +1,4 @@
-"""The ranker: a small network that orders candidates by how likely another image shows them."""
+"""The ranker: a small network that orders candidates by their chance to recur in another image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..pretrained import RANKER
 from .candidate_features import FEATURES
 
 MAX_DEVIATIONS, CHUNK = 6.0, 2048
-"""Features are clipped at this many standard deviations from their mean. This many candidates are
+"""Features are clipped at MAX_DEVIATIONS standard deviations from their mean. CHUNK candidates are
 ranked at a time, so that their features stay in the processor's cache."""
 
 
