@@ -39,7 +39,7 @@ AFFINITY_REGULARIZATION = 20.0
 much as this number of matches, in case the matches are few or on one line. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES, SIMILARITY_ITERATIONS = 5000, 20
-"""A similarity fits at most MAX_SIMILARITY_SAMPLES matches, after SIMILARITY_ITERATIONS steps."""
+"""The similarity fit uses up to MAX_SIMILARITY_SAMPLES matches in SIMILARITY_ITERATIONS steps."""
 
 CORNER_WINDOW_PX = 7
 """The strength of a corner is measured in a window with this side, about the side of a patch."""

@@ -77,8 +77,8 @@ JUMPS = (16, 8, 4, 2, 1)
 five passes. A plane can thus spread over 31 pixels."""
 
 SURE_CORRELATION, MIN_CORRELATION = 0.9, 0.5
-"""A pixel whose window correlates by `SURE_CORRELATION` tries no other plane, to save time. A
-neighbour refines a depth only if the windows correlate by `MIN_CORRELATION`. Chosen by hand."""
+"""A pixel whose window correlates by SURE_CORRELATION or more tries no other plane, to save time. A
+neighbour refines a depth only if windows correlate by MIN_CORRELATION or more. Chosen by hand."""
 
 SMOOTHING_RADII, MIN_WEIGHT = (4, 3), 0.02
 """Planes are refined twice, and each time smoothed by a fit in windows of these radii, in pixels of

@@ -48,7 +48,7 @@ class MultiViewReconstruction:
         pairs: number of pairs that were matched.
         pair_choice: how the pairs were chosen, such as "exhaustive", "sequential:10" or "similar".
         left_out: largest fraction of an image that was ignored as a static overlay, such as a logo.
-        seconds: time that each stage took in this run, about 0 if an earlier run had finished it.
+        seconds: time of each stage in this run, about 0 if an earlier run finished the stage.
         files: files and folders that were written.
     """
 

@@ -183,7 +183,7 @@ class Stages:
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
         """Return a folder that holds all images, and no results.
 
-        For a list of files, or an output folder inside the given one, it holds links to the images.
+        For a list of files, or an output folder among the images, it holds links to the images.
         """
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
@@ -359,7 +359,7 @@ class Stages:
             verified = {(a, b): count for a, b, count in noted["verified"]}
             components = [frozenset(names) for names in noted["components"]]
             return pycolmap.Reconstruction(sparse), verified, components
-        # SQLite would take the log of a killed run's database for that of the new database.
+        # SQLite would mistake the log of a killed run's database for the log of the new database.
         for old in (*self.work.glob("mapping-*.json"), *self.output.glob("database.db-*")):
             old.unlink()
         with atomic_path(database) as path:
@@ -465,6 +465,6 @@ def _depth_task(
 def _fuse_task(
     images: list[RegisteredImage], paths: Mapping[str, Path], stride_px: int
 ) -> np.ndarray:
-    images = [image for image in images if image.view.name in paths]  # some have no map
+    images = [image for image in images if image.view.name in paths]  # some images have no map
     maps = [(load_arrays(paths[image.view.name]) or {})["depth"] for image in images]
     return fuse_depth_maps([limited_view(image.view) for image in images], maps, stride_px)

@@ -45,8 +45,8 @@ MIN_DENSE_VIEWS = 3
 """A dense track needs at least this number of images: a third image checks the match of two."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
-"""Images are cached, because successive images share neighbours: at least `CACHED_IMAGES`, and more
-if all have at most `CACHED_PIXELS` pixels together (of seven bytes each)."""
+"""Images are cached, because successive images share neighbours: at least `CACHED_IMAGES` images,
+and more as long as they have at most `CACHED_PIXELS` pixels together (seven bytes each)."""
 
 
 class Surfaces(NamedTuple):
