@@ -215,7 +215,7 @@ def detect_rectification(
             "images"
         )
     elif spread[2] - spread[0] < MIN_DISPARITY_SPREAD_PX:
-        reason = f"all disparities are nearly the same, about {spread[1]:.3g} px"
+        reason = f"matches on the same row all have about the same disparity ({spread[1]:.3g} px)"
     elif is_static(disparity):
         reason = "nothing moves between the images"
     elif spread[2] - spread[0] < MIN_PLANAR_SPREAD_PX:
