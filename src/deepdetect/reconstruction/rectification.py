@@ -33,7 +33,7 @@ percentile. Matches at whole pixels always spread by 1, because their positions 
 
 MIN_PLANAR_SPREAD_PX = 8.0
 """If one homography explains all matches, a pair is rectified only if its disparities spread by at
-least this, as on a slanted plane. After a small rotation of the camera, they spread less."""
+least this, as on a slanted plane. Small rotations of the camera spread disparities less."""
 
 GRID_SIZE_PX = 8
 """One match is taken from each cell of the left image; cells have this side. Chosen by hand."""

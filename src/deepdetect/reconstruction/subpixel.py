@@ -105,8 +105,8 @@ def local_affinities(
 ) -> np.ndarray:
     """Fit an affinity to the converged matches in the window around each match.
 
-    Returns (N, 2, 2) float32 matrices from the first image to the second. If there are few matches
-    around a match, or they are badly spread, its matrix is close to `overall`, the (2, 2) matrix of
+    Returns (N, 2, 2) float32 matrices from the first image to the second. If the matches
+    around a match are few or badly spread, its matrix is close to `overall`, the (2, 2) matrix of
     the similarity of all matches. `shape` is (H, W) of the first image.
     """
     pixels0 = np.asarray(pixels0, np.int64)

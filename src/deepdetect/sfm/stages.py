@@ -67,7 +67,7 @@ from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
-"""The choice "auto" matches all pairs of images if there are at most this number of images."""
+"""The choice "auto" matches all pairs if there are at most this number of images."""
 
 WORK = "work"
 """Name of the folder of intermediate results, inside the output folder."""

@@ -63,7 +63,7 @@ a caption stands still. Images taken with a still camera agree nearly everywhere
 
 MIN_EXPLAINED = 0.3
 """A homography must explain at least this fraction of what both images show in common. Wrong ones
-explain up to 0.12 of similar towers; 0.59 is explained of screens of which half stands still."""
+explain up to 0.12 (similar towers). Screens of which half stands still have 0.59."""
 
 MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
 """Images contradict each other if the RMS residual of their joint fit exceeds the inlier threshold
