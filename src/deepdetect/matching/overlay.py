@@ -1,8 +1,8 @@
-"""Find what stands still over images whose scene moves: frames, captions, logos, the own bonnet.
+"""Find overlays, which stand still while the scene moves: frames, captions, logos, a car's bonnet.
 
-Places that look the same at the same pixels would fit a scene without motion. They are an overlay
-if all matches around them move clearly, as one scene that fills more of the image, and they do not
-shift together by a fraction of a pixel, as far parts of a scene do.
+Regions that look the same at the same pixels of two images are overlays if all matches around them
+clearly move, as one scene that fills more of the image. Regions that shift as a whole by a fraction
+of a pixel are not overlays but distant parts of the scene.
 """
 
 from __future__ import annotations
@@ -23,47 +23,47 @@ from .guided import ImagePair, Pair, Sources
 from .guided.proposals import propose
 
 COMPARED_SIDE_PX = 640
-"""Images are reduced to this longer side before they are compared: captions stay legible in it. All
-lengths below are in pixels of the reduced images."""
+"""Images are reduced to this longer side before they are compared: captions stay legible at this
+size. All lengths below are in pixels of the reduced images."""
 
 WINDOW_PX, MAX_DIFFERENCE, MIN_GRADIENTS = 7, 0.3, 32.0
-"""A place looks the same in two images if, in a window of this side, the difference of their
-gradients is below the second value times the sum of both, and this sum is above the third: 2 grey
+"""A place looks the same in two images if, in a window of side WINDOW_PX, the difference of their
+gradients is below MAX_DIFFERENCE times the sum of both, and this sum is above MIN_GRADIENTS: 2 grey
 levels per pixel in each image, as Sobel's filter scales them."""
 
 MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
-"""A match stands still if it moves by less than the first value, about the error of a keypoint. The
-scene clearly moves at a place if this number of its nearest moving matches move by more than the
-second. At the end of a street, which hardly moves for a camera that drives along it, few do."""
+"""A match stands still if it moves by less than MAX_STILL_PX, about the error of a keypoint. The
+scene clearly moves at a place if its NEIGHBOURS nearest moving matches move by more than
+MIN_MOTION_PX. At the end of a street, seen from a camera that drives along it, few do so."""
 
 MIN_AREA_PX, MIN_CLEAR_SHARE = 128, 0.67
-"""A still region is an overlay if the scene clearly moves at this share of its pixels, and if this
-number of pixels do not look the same where the scene moves to: half a word of a caption."""
+"""A still region is an overlay if the scene clearly moves at the fraction MIN_CLEAR_SHARE of it,
+and if MIN_AREA_PX of its pixels (half a word of a caption) differ from where the scene moves to."""
 
 MAX_SHIFT_PX, MIN_UNITY, MIN_ROUNDNESS = 0.15, 0.6, 0.5
-"""Far parts of a scene, unlike overlays, shift as a whole: by more than the first value, and by
-more than the second times the median shift of their windows; where text covers a scene, windows
-differ. The shift of a window is known if its structure tensor has the last ratio of determinant to
+"""Distant parts of a scene, unlike overlays, shift as a whole: by more than MAX_SHIFT_PX, and by
+more than MIN_UNITY times the median shift of their windows (under a text, windows differ). A
+window's shift is known if its structure tensor's determinant exceeds MIN_ROUNDNESS times the
 squared half trace, because an edge that moves along itself looks still."""
 
 CELL_PX = 32
-"""The motion of the scene is interpolated between squares of this side, and matches are counted by
-those that hold some."""
+"""The motion of the scene is interpolated between squares of this side. Matches are counted by the
+number of squares that contain some."""
 
 SOBEL_GAIN = 8
-"""Sobel's filter of side 3 returns this number of times the gradient."""
+"""Sobel's 3 x 3 filter returns this multiple of the gradient."""
 
 MIN_COMMON = 0.95
-"""The frames of two images stand still if they have this share of their union in common."""
+"""The uniform borders of two images stand still if they share at least this part of their union."""
 
 
 def scene_of(
     images: Pair, masks: Sequence[np.ndarray | None], seed: int = 0
 ) -> tuple[ImagePair, float]:
-    """Leave out the frames of two (H, W, 3) images, and what stands still while the scene moves.
+    """Leave out the uniform borders of two (H, W, 3) images, and overlays that stand still.
 
-    Returns both images as luma, in which these places are filled smoothly, with the ignore `masks`,
-    enlarged by them; and the share of the image that stands still, of which a warning tells.
+    Returns both images as luma, with these areas filled smoothly and added to the ignore `masks`;
+    and the share of the image that stands still, which a warning states.
     """
     left = [uniform_frame(image) for image in images]
     first, second = (filled_smoothly(luma(each), m) for each, m in zip(images, left, strict=True))
@@ -97,9 +97,9 @@ def tell_still(share: float) -> None:
 
 
 def find_overlay(grays: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:
-    """Return where (H, W) uint8 images show one overlay, (H, W) bool; none if their sizes differ.
+    """Return an (H, W) bool mask of the overlay in (H, W) uint8 images; empty if sizes differ.
 
-    It stands still in all images, and contradicts the motion from one image to the next.
+    An overlay stands still in all images, and contradicts the motion from one image to the next.
     """
     if len({gray.shape for gray in grays}) > 1 or len(grays) < 2:
         return np.zeros(grays[0].shape, bool)
@@ -167,10 +167,10 @@ def _contradicted(still: np.ndarray, images: ImagePair, seed: int) -> np.ndarray
     column, row = np.rint(scene).astype(int).T
     if found is None:
         return np.zeros(still.shape, bool)
-    tells = found.inliers & ~exactly[row, column]  # a keypoint that moves there is inexact
+    tells = found.inliers & ~exactly[row, column]  # a match moving there is inexact
     scene, motion = scene[tells], motion[tells]
     cells, moving_cells = (len(np.unique(xy // CELL_PX, axis=0)) for xy in (standing, scene))
-    # If more of the image stands still than moves, something moves before a still camera.
+    # If more of the image stands still than moves, something moves in front of a still camera.
     if len(scene) < NEIGHBOURS or cells > moving_cells:
         return np.zeros(still.shape, bool)
     flow, least = _motion_of_scene(scene, motion, size)
@@ -200,7 +200,7 @@ def _shifts(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _motion_of_scene(
     scene: np.ndarray, motion: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate the median motion (H, W, 2) and the least (H, W) of the nearest matches."""
+    """Interpolate the nearest matches' median motion (H, W, 2) and least motion length (H, W)."""
     columns, rows = (np.arange(CELL_PX // 2, side + CELL_PX, CELL_PX) for side in size)
     gaps = np.linalg.norm(np.dstack(np.meshgrid(columns, rows))[..., None, :] - scene, axis=-1)
     nearest = motion[np.argpartition(gaps, NEIGHBOURS - 1)[..., :NEIGHBOURS]]

@@ -72,12 +72,12 @@ def match_images(
         ignore: a tuple with a mask or None for each image, or one mask for both images. A mask is
             true where no keypoint is wanted.
         model: the geometry, which also guides the matching: "homography" (planes, pure rotation),
-            "fundamental" (any static scene), "essential" (needs both cameras), or "auto": the one
-            of the first two that fits the images.
+            "fundamental" (any static scene), "essential" (needs both cameras), or "auto": whichever
+            of "homography" and "fundamental" fits the images.
         mutual: keep only one-to-one matches that are found in both directions, which takes twice
             the time. The order of the images then does not matter.
         tentative_matches: matches of another matcher (LightGlue, LoFTR, clicks), some of which may
-            be wrong: two (K, 2) arrays of corresponding positions. They are asked before our own.
+            be wrong: two (K, 2) arrays of corresponding positions. They are tried first.
         seed: seed of all random choices.
         options: how the final geometry is estimated.
         progress: called with the name of each stage when it ends.
@@ -87,8 +87,8 @@ def match_images(
         there are no matches, and `Matches.success` is False.
 
     Raises:
-        ImageError: an image cannot be read, is a panorama or a fisheye picture, or both are by a
-            lens that bends lines; only the model "homography" may apply to these.
+        ImageError: an image cannot be read; or, except for the model "homography", is a panorama or
+            a fisheye picture, or both images are from a lens that bends straight lines.
         OptionError: an option is unknown or out of its range.
 
     Example:
@@ -119,7 +119,7 @@ def match_images(
     matches = _match_guided(pair, (keypoints0, keypoints1), given, *settings)
     matches = _noted(_unmasked(matches, masks), left_out)
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
-        _require_pinholes((image0, image1), rgb, rim=True)  # no eyepiece: no homography fits
+        _require_pinholes((image0, image1), rgb, rim=True)  # with an eyepiece, a homography fits
     if not (mutual and matches.success):
         return matches
     given = None if given is None else given[::-1]
@@ -151,10 +151,10 @@ def match_features(
             least nine mutual neighbours, learned descriptors (not cross-modal) or RootSIFT, and
             keypoints with sizes and angles.
         ratio: maximum ratio of the descriptor distances to the nearest and the second-nearest
-            neighbour. None: 0.85, 0.91 for "learned", 0.9 for "cross-modal", 0.88 for other learned
-            descriptors, which is as strict for each.
+            neighbour. None: 0.91 for "learned", 0.9 for "cross-modal", 0.88 if otherwise learned,
+            0.85 for all others. These limits are equally strict.
         mutual: keep only mutual nearest neighbours.
-        seed: seed of a matcher that is random.
+        seed: seed of a randomised matcher.
 
     Returns:
         The matches, without a geometry (see `estimate_geometry`). Their scores are 1 - ratio or,
@@ -286,13 +286,13 @@ def _checked_positions(points: Any) -> Points:
 
 
 def _require_pinholes(images: tuple[Any, Any], rgb: Points, *, rim: bool) -> None:
-    """Raise an ImageError if one of two images is not by a pinhole camera."""
+    """Raise an ImageError if one of two images was not taken by a pinhole camera."""
     for number, image in enumerate(images):
         require_pinhole(image, rgb[number], rim=rim, name=f"images[{number}]")
 
 
 def _unmasked(matches: Matches, masks: Sequence[np.ndarray | None]) -> Matches:
-    """Drop matches that end in a mask: the second image may show them where it has no keypoint."""
+    """Drop matches that start or end in a mask: guided matches may end where no keypoint is."""
     dropped = at_pixels(masks[0], matches.points0) | at_pixels(masks[1], matches.points1)
     return matches[~dropped] if dropped.any() else matches
 

@@ -1,4 +1,4 @@
-"""Registration of one image to another by a homography."""
+"""Register one image to another by a homography."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
 
 MIN_AGREEMENT, CLEAR_CORRELATION = 0.75, 0.5
-"""Two images contradict a homography if less than the first fraction of what they show agrees with
-it, unless half of it correlates by the second value: lit in another way, as by night, the rest
-differs. Streets from frames 5 m apart, of which only the road fits, have up to 0.74 and 0.48."""
+"""Two images contradict a homography if less than MIN_AGREEMENT of their structure agrees with it,
+unless their median correlation is CLEAR_CORRELATION or more: under other light, as by night, the
+rest may differ. Street views 5 m apart, of which only the road fits, reach 0.74 and 0.48."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,7 +62,7 @@ class Registration:
         applied: the images of `apply_to` warped into the frame, (H, W, C) with all their bands and
             in their own type. Where they have no content, they are 0, or their no-data value.
         value_range: the values of black and white in `warped`, if it is uint16.
-        left_out: share of the first image that was left out, because it stands still.
+        left_out: share of the first image that was ignored because it stands still, as captions do.
     """
 
     homography: np.ndarray
@@ -118,8 +118,8 @@ def register(
 ) -> Registration:
     """Find the homography between two images and warp the second into the frame of the first.
 
-    For planes, and for photographs taken from one place. The homography comes from a few matches,
-    is refined on the images, and is verified by dense matches.
+    This suits planes, and photographs taken from one place. The homography comes from a few
+    matches, is refined on the images, and is verified by dense matches.
 
     Args:
         image0, image1: anything `load_image` takes.
@@ -184,7 +184,7 @@ def register(
     moved, size = homography @ translation_matrix(left, top), (right - left, bottom - top)
     warped, valid = warp_visible(deep, moved, size)
     (first, empty), hidden = opaque_part(first), opaque_part(deep)[1]
-    if empty is not None:  # there the first image shows what is behind it
+    if empty is not None:  # the warped image shows through transparent pixels
         first = np.where((empty & valid)[..., None], to_8_bits(warped), first)
     values = reading.deep_range or (0, 65535)
     warped = from_16_bits(warped, values) if warped.dtype == np.uint16 else warped
@@ -194,7 +194,7 @@ def register(
         bands = load_pixels(each, channels, deep=True, raw=True)
         if bands.shape[:2] != deep.shape[:2]:
             raise OptionError(
-                f"{file_name(each)} must have the size of the second image: leave it out"
+                f"{file_name(each)} must have the size of the second image: leave this image out"
             )
         no_data = read_metadata(each).no_data if is_file(each) else None
         seen = hidden if each is image1 else None

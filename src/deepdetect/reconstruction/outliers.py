@@ -1,6 +1,6 @@
 """Filter the points of a cloud: minimum parallax, and statistical outlier removal (SOR).
 
-SOR is that of PCL and Open3D (Rusu et al., "Towards 3D point cloud based object maps for household
+SOR works as in PCL and Open3D (Rusu et al., "Towards 3D point cloud based object maps for household
 environments", 2008), but in `disparity_space`, where the points of a stereo pair are evenly spaced.
 In a street scene with 3 % outliers, it removed 96 % of them and no other points. In 3D space, SOR
 would have removed only 10 % of them.
@@ -74,7 +74,7 @@ def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
     for start in range(0, len(centred), QUERIES):
         some = centred[start : start + QUERIES]
         _, squares = tree.knnSearch(some, count, params={"checks": -1})
-        # Column 0 is left out: it is the point itself, or another one in the same place.
+        # Column 0 is left out: it holds the point itself, or another point in the same place.
         means[start : start + QUERIES] = np.sqrt(squares[:, 1:].astype(np.float64)).mean(1)
     return means
 

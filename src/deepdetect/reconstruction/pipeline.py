@@ -1,7 +1,7 @@
 """Reconstruct coloured 3D points from two images, as in Figure 8 of the DeepDetect paper.
 
 For a pair that is not rectified, the steps are keypoints, matches, checks, pose and triangulation.
-For a rectified pair a dense disparity map is computed, and its values at the keypoints of the left
+For a rectified pair, a dense disparity map is computed, and its values at the keypoints of the left
 image give the points.
 """
 
@@ -44,7 +44,7 @@ from .result import Reconstruction
 from .two_view import checked_pose, reconstruct_two_view, refined_corners, scene_with_depth
 
 SOR_WINDOW_PX = 9
-"""Statistical outlier removal (SOR) compares a pixel of a rectified pair with the others in a
+"""Statistical outlier removal (SOR) compares a pixel of a rectified pair with all other pixels in a
 window with this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
@@ -71,8 +71,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct a scene from two images.
 
-    For a rectified pair a dense disparity map is computed, and the detector only chooses which of
-    its pixels become points. `disparity_map` computes that map without a detector.
+    For a rectified pair, a dense disparity map is computed, and the detector only chooses which
+    pixels become points. `disparity_map` computes this map without a detector.
 
     Args:
         image0, image1: anything `load_image` takes. The points are in the frame of the first
@@ -82,7 +82,7 @@ def reconstruct(
         calibration: camera file, such as calib.json. A `Calibration` also works. By default the
             focal length is `focal_px`, or is read from the EXIF data of the images.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
-        rectified: whether matches lie on the same row of both images. None detects it.
+        rectified: whether matches lie on the same row of both images. None: the images decide.
         selection: which pixels of a heat map become keypoints; None takes those with a probability
             above 0.5. With a density of 1, every pixel of a rectified pair becomes a point, with
             the disparity options `DENSE`. `subpixel` is ignored.
@@ -97,7 +97,7 @@ def reconstruct(
     Raises:
         ImageError: an image cannot be read or used.
         OptionError: an option is unknown or out of its range.
-        ReconstructionError: there is no calibration, it is wrong, or the pair gives no depth.
+        ReconstructionError: the calibration is missing or wrong, or the pair gives no depth.
 
     Example:
         >>> import cv2
@@ -193,7 +193,7 @@ def estimate_pose(
 
     Raises:
         ImageError: an image cannot be read or used.
-        ReconstructionError: there is no calibration, or it is wrong.
+        ReconstructionError: the calibration is missing or wrong.
         NoDepthError: the images do not overlap or show one plane, or the camera did not move or
             only rotated, so the matches do not determine the pose.
 
@@ -297,9 +297,9 @@ def sor_inliers_on_grid(
 ) -> np.ndarray:
     """Return (N,) bool, True for (N, 2) pixels of the left image that are not statistical outliers.
 
-    Unlike in `sor_inliers`, the neighbours of a pixel are all others in a window. Its distance from
-    them is the root mean square difference in disparity. A pixel without neighbours is an outlier
-    only if most pixels have neighbours.
+    Unlike in `sor_inliers`, the neighbours of a pixel are all other pixels in a window. A pixel's
+    distance from its neighbours is the root mean square difference in disparity. A pixel without
+    neighbours is an outlier only if most pixels have neighbours.
     """
     if not len(pixels):
         return np.ones(0, bool)

@@ -1,7 +1,7 @@
-"""Recognise rectified pairs, and check that the calibration fits and that they show depth.
+"""Recognise rectified pairs, and check that the calibration fits them and that they show depth.
 
 The matches of a rectified pair lie on the same row in both images. A pair is rectified if about as
-many matches do so as fit a fundamental matrix, or rows that are shifted, tilted and scaled.
+many matches do so as fit a fundamental matrix, or a model of shifted, tilted and scaled rows.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_st
 from ..matching.guided import ImagePair, Sources
 
 MAX_ROW_DISTANCE_PX = 1.0
-"""A match of a rectified pair may lie at most this far from its row, and the values of cy of its
-views may differ by twice as much. Chosen by hand."""
+"""The rows of a match may differ by at most this in a rectified pair, and the values of cy (the row
+of the principal point) of both views by at most twice this. Chosen by hand."""
 
 MIN_INLIER_RATIO = 0.9
 """A pair is rectified only if its matches on the same row number at least this fraction of the
@@ -33,16 +33,16 @@ percentile. Matches at whole pixels always spread by 1, because their positions 
 
 MIN_PLANAR_SPREAD_PX = 8.0
 """If one homography explains all matches, a pair is rectified only if its disparities spread by at
-least this, as on a slanted plane. After a small rotation of the camera, they spread less."""
+least this, as on a slanted plane. Small rotations of the camera spread disparities less."""
 
 GRID_SIZE_PX = 8
-"""The left image is divided into cells of this side. Each gives one match. Chosen by hand."""
+"""One match is taken from each cell of the left image; cells have this side. Chosen by hand."""
 
 ITERATIONS = 500
 """RANSAC in `_best_other_rows` draws this number of samples of three matches. Chosen by hand."""
 
 MIN_COARSE_INLIERS = 50
-"""The coarse pass decides only if this many matches fit a fundamental matrix. Chosen by hand."""
+"""The coarse pass decides only if at least this number of matches fit a fundamental matrix."""
 
 MAX_COARSE_ROW_ERROR_PX = 0.6
 """The coarse pass accepts a pair as rectified only if its `_row_error`, in pixels of the full
@@ -164,10 +164,10 @@ def _coarse_pass(
 def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
     """Return the `MIN_INLIER_RATIO` quantile of the row errors of a pair that looks rectified.
 
-    The row error is how many pixels the rows of the two images are off at a position. A single
-    match is too inaccurate, so a smooth function is fitted to y1 - y0 of all matches. It depends on
-    the position, for rotated views and lens distortion, and on the disparity, for a camera that
-    also moved up or down.
+    The row error at a position is the difference of the rows of both images in pixels. A single
+    match is too inaccurate, so a smooth function is fitted to y1 - y0 of all matches. The function
+    depends on the position, for rotated views and lens distortion, and on the disparity, for a
+    camera that also moved up or down.
     """
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
@@ -206,7 +206,7 @@ def detect_rectification(
     )
     best = max(by_fundamental, by_other_rows)
     reason = ""
-    # Rows are not fitted to samples, so the NFA of a fundamental matrix is a stricter test.
+    # Rows have no fitted parameters, so the NFA (false alarms) of a fundamental matrix is stricter.
     if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     elif on_rows_count < MIN_INLIER_RATIO * best:
@@ -215,7 +215,7 @@ def detect_rectification(
             "images"
         )
     elif spread[2] - spread[0] < MIN_DISPARITY_SPREAD_PX:
-        reason = f"all matches on rows have about the same disparity ({spread[1]:.3g} px)"
+        reason = f"matches on the same row all have about the same disparity ({spread[1]:.3g} px)"
     elif is_static(disparity):
         reason = "nothing moves between the images"
     elif spread[2] - spread[0] < MIN_PLANAR_SPREAD_PX:
@@ -241,8 +241,8 @@ def _best_other_rows(
 ) -> np.ndarray:
     """Fit y1 - y0 as a linear function of x0 and y0 by RANSAC; return its (M,) bool inliers.
 
-    The rows are shifted, tilted and scaled. A sample has three matches instead of the seven of a
-    fundamental matrix, so more outliers are tolerated.
+    This model allows rows to be shifted, tilted and scaled. A sample has three matches instead of
+    the seven of a fundamental matrix, so more outliers are tolerated.
     """
     shift = points1[:, 1] - points0[:, 1]
     best = np.zeros(len(points0), bool)
@@ -342,7 +342,7 @@ def _rotation_errors(
     camera, rays = calibration.camera1, calibration.camera0.rays(pixels)
     matched = pixels - np.column_stack([disparity, np.zeros(len(disparity))])
     wanted = camera.rays(matched)[:, 0]
-    # Each match gives an angle about the vertical. Their median is a good enough start.
+    # Each match gives an angle about the vertical. The median angle is a good enough start.
     angle = np.median(np.arctan(wanted) - np.arctan(rays[:, 0]))
     rotation = cv2.Rodrigues(np.array([0, angle, 0]))[0]
     for _ in range(ROBUST_ITERATIONS):

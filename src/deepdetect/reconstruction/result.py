@@ -24,7 +24,7 @@ SCALE = {
 }
 
 SHAPE = "; if the cameras differ in cx, depths are wrong unless disparity_offset_px is given"
-"""This warning is for a rectified pair whose calibration does not state the disparity offset."""
+"""Warning for rectified pairs whose calibration does not state the disparity offset."""
 
 
 @suggest_keywords
@@ -38,14 +38,14 @@ class Reconstruction:
         pixels: (N, 2) float32 positions of the points in the left image.
         disparity: (N,) float32 in pixels for rectified pairs, else None. The match of (x, y) in
             the left image is (x - disparity, y) in the right image.
-        matched: (N,) bool, True for points that were matched in both images. The others are hidden
-            in the right image or at the edge of an occluding surface. They got the depth of an
-            adjacent surface, and exist only if every pixel of a rectified pair becomes a point.
+        matched: (N,) bool, True for points that were matched in both images. All other points are
+            hidden in the right image or at the edge of an occluding surface, and have the depth of
+            an adjacent surface. They exist only if every pixel of a rectified pair becomes a point.
         unit: "mm" if the baseline is known. Otherwise "baseline": the distance between the cameras
             is 1, and the true scale is not known.
         size: (width, height) of the left image.
         rectified: whether the pair was treated as rectified.
-        rectification: the numbers on which that decision is based; None if the caller decided.
+        rectification: the numbers on which `rectified` is based; None if the caller set it.
         calibration: intrinsics and baseline of the cameras.
         pose: pose of the right camera if the pair is not rectified, else None.
         reprojection_errors: (N,) float32 root mean square distances, in pixels, of the projected
@@ -54,7 +54,7 @@ class Reconstruction:
         matches: number of matches that were triangulated.
         dropped: number of matches that each check removed, in the order of the checks.
         seconds: time that each stage took.
-        left_out: share of the image that was left out, because it stands still.
+        left_out: share of the image that was ignored because it stands still while the scene moves.
     """
 
     points: np.ndarray

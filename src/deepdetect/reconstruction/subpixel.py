@@ -39,10 +39,10 @@ AFFINITY_REGULARIZATION = 20.0
 much as this number of matches, in case the matches are few or on one line. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES, SIMILARITY_ITERATIONS = 5000, 20
-"""The similarity is fitted to at most this number of matches, in this number of steps."""
+"""The similarity fit uses up to MAX_SIMILARITY_SAMPLES matches in SIMILARITY_ITERATIONS steps."""
 
 CORNER_WINDOW_PX = 7
-"""Strengths of corners are measured in a window with this side, about the side of a patch."""
+"""The strength of a corner is measured in a window with this side, about the side of a patch."""
 
 
 def refine_matches(
@@ -87,7 +87,7 @@ def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     every = -(-len(points0) // MAX_SIMILARITY_SAMPLES)
     z0, z1 = (points[::every].astype(np.float64) @ [1, 1j] for points in (points0, points1))
     weights, factor = np.ones(len(z0)), complex(1)
-    # The sum of distances has one minimum, so that few other matches change little.
+    # The sum of distances is minimised: it has one minimum, and a few outliers change it little.
     for _ in range(SIMILARITY_ITERATIONS if len(z0) >= 3 else 0):
         first, second = (z - np.average(z, weights=weights) for z in (z0, z1))
         held = first * weights
@@ -105,13 +105,13 @@ def local_affinities(
 ) -> np.ndarray:
     """Fit an affinity to the converged matches in the window around each match.
 
-    Returns (N, 2, 2) float32 matrices from the first image to the second. If there are few matches
-    around a match, or they are badly spread, its matrix is close to `overall`, the (2, 2) matrix of
+    Returns (N, 2, 2) float32 matrices from the first image to the second. If the matches
+    around a match are few or badly spread, its matrix is close to `overall`, the (2, 2) matrix of
     the similarity of all matches. `shape` is (H, W) of the first image.
     """
     pixels0 = np.asarray(pixels0, np.int64)
     column, row = pixels0.T
-    # Positions are relative to the middle, as sums of large squares would lose small differences.
+    # Positions are relative to the image centre: sums of large squares would lose precision.
     across, down = column - shape[1] / 2, row - shape[0] / 2
     rest = points1 - np.column_stack([across, down]) @ overall.T
     size = AFFINITY_WINDOW_PX

@@ -24,8 +24,8 @@ from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners
 
 MAX_EPIPOLAR_DISTANCE_PX, MAX_REPROJECTION_ERROR_PX = 1.0, 0.5
-"""A match agrees with the pose if its Sampson distance is below the first, and the root mean square
-reprojection error of its point in both images below the second. Chosen by hand."""
+"""A match agrees with the pose if its Sampson distance is below MAX_EPIPOLAR_DISTANCE_PX, and its
+root mean square reprojection error below MAX_REPROJECTION_ERROR_PX. Chosen by hand."""
 
 POSE_CELLS, GRID_SIZE_PX = 10_000, 16
 """The pose is estimated from the best corner in each of about POSE_CELLS cells. The checks use one
@@ -36,13 +36,13 @@ MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
 """A pose explains a match if the Sampson distance is below this, as for a fundamental matrix."""
 
 MIN_POSE_RATIO, MIN_IN_FRONT_FRACTION = 0.75, 0.75
-"""A pose is accepted only if it explains at least this fraction of the number of matches that the
-fundamental matrix explains (a correct calibration gives about 1), and has this fraction of its
-inliers in front of both cameras. Chosen by hand."""
+"""A pose is accepted only if it explains at least MIN_POSE_RATIO times as many matches as the
+fundamental matrix (a correct calibration gives about 1), and if the fraction MIN_IN_FRONT_FRACTION
+of its inliers lies in front of both cameras. Chosen by hand."""
 
 FOCAL_FACTORS, MAX_FOCAL_ERROR_RATIO = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0), 0.5
-"""The given focal length is rejected if one of these multiples has less than this fraction of its
-median error. A focal length that is wrong by a fifth is still accepted."""
+"""A focal length is rejected if multiplying it by one of FOCAL_FACTORS reduces the median error
+below MAX_FOCAL_ERROR_RATIO times its value. A focal length wrong by a fifth is still accepted."""
 
 GOOD_ERROR_PX = 0.1
 """No other focal length is tried if the given one has a median error below this. Chosen by hand."""
@@ -147,7 +147,7 @@ def checked_pose(
 ) -> RelativePose:
     """Estimate the pose from refined (M, 2) matches, or raise an error that says why it fails.
 
-    The fundamental matrix, which does not depend on the calibration, explains the matches.
+    The pose is checked against the fundamental matrix, which was fitted without a calibration.
     """
     cells = grid_subsample(points0, GRID_SIZE_PX, seed)
     errors = epipolar_errors(points0[cells], points1[cells], fundamental)
@@ -166,10 +166,10 @@ def checked_pose(
 def check_pose(
     pose: RelativePose | None, cells: np.ndarray, explained: np.ndarray, calibration: Calibration
 ) -> RelativePose:
-    """Return the pose of all matches, or raise a ReconstructionError if the calibration is wrong.
+    """Return the given pose, or raise a ReconstructionError if the calibration is wrong.
 
-    It then explains far fewer of some matches, with the indices `cells` (K,), than the fundamental
-    matrix, which explains the (K,) bool `explained`.
+    The calibration is wrong if, of the matches with the indices `cells` (K,), the pose explains far
+    fewer than the fundamental matrix. `explained` (K,) bool is what that matrix explains.
     """
     wrong_focal = _wrong_focal(calibration)
     if pose is None:

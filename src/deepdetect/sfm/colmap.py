@@ -25,15 +25,15 @@ from ..geometry.camera import Calibration, Camera
 from ..io.exif import camera_from_exif
 
 PIXEL_CENTRE, SIFT_NUMBERS = 0.5, 128
-"""COLMAP has the centre of the first pixel at (0.5, 0.5), this package at (0, 0). Its descriptors
-have SIFT_NUMBERS numbers."""
+"""The centre of the upper left pixel is (0.5, 0.5) in COLMAP and (0, 0) in this package. A
+descriptor in COLMAP's database has `SIFT_NUMBERS` numbers."""
 
 CENTRE_TOLERANCE_PX, ROWS = 1e-6, 256
-"""A principal point this close to the middle is in the middle up to rounding errors. An image is
-undistorted in strips of ROWS rows, which limits the memory needed."""
+"""`CENTRE_TOLERANCE_PX` absorbs rounding errors before side lengths are rounded down to whole
+pixels. An image is undistorted in strips of `ROWS` rows, which limits the memory needed."""
 
 ESTIMATED_FOCAL_FACTOR = 1.2
-"""Guess of an unknown focal length, relative to the image's longer side, as in COLMAP."""
+"""An unknown focal length is guessed as this multiple of the image's longer side, as in COLMAP."""
 
 
 @contextmanager
@@ -136,7 +136,7 @@ class CameraIntrinsics:
 
     @property
     def centred(self) -> CameraIntrinsics:
-        """`without_border`, cropped around the principal point, which then is in the middle.
+        """`without_border`, cropped further so that the principal point is in the middle.
 
         Raises a ReconstructionError if the principal point lies outside the image.
         """
@@ -154,7 +154,7 @@ class CameraIntrinsics:
     def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
         """Undistort an image, (H, W) or (H, W, 3), taken by this camera.
 
-        The result is that of `pinhole` (default: `self.pinhole`). The image may be a scaled copy.
+        The result is what `pinhole` (default: `self.pinhole`) sees. `image` may be a scaled copy.
         """
         if not self.distorts and (pinhole is None or pinhole.size == image.shape[1::-1]):
             return image
@@ -205,8 +205,8 @@ def initial_intrinsics(
 ) -> dict[str, CameraIntrinsics]:
     """Return the intrinsics of each image: those in `known`, or initial values to be refined.
 
-    These have the focal length `focal_px`, else that of EXIF, else a guess. Images that share a
-    camera (see `MultiViewOptions`) get the same object.
+    The initial focal length is `focal_px` if given, else that of EXIF, else a guess. Images that
+    share a camera (see `MultiViewOptions`) get the same object.
     """
     begins = {}
     for name, size in sizes.items():
@@ -226,7 +226,7 @@ def initial_intrinsics(
         name: {None: begin, True: begin.size, False: name}[single_camera]
         for name, begin in begins.items()
     }
-    # Images with a guessed focal length come last, so a shared camera prefers one from EXIF.
+    # Guessed focal lengths come last, so a shared camera prefers a focal length from EXIF.
     for name in sorted(begins, key=lambda name: begins[name].source == "estimated"):
         shared.setdefault(keys[name], begins[name])
     return {name: shared[keys[name]] for name in sizes}
@@ -240,7 +240,7 @@ def write_database(
     """Write a new COLMAP database to a file that does not exist or is empty.
 
     Images with the same intrinsics object share a camera. Keypoints without sizes are written
-    without scale and orientation. `matches` are (K, 2) indices of keypoints, by pair of images.
+    without scale and orientation. `matches` maps each pair of images to (K, 2) keypoint indices.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
         cameras: dict[int, tuple[int, int]] = {}  # camera ID and rig ID, by `id` of the intrinsics
@@ -285,8 +285,8 @@ def orientations_of(points: Keypoints) -> np.ndarray:
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
     """Convert descriptors to SIFT's format, (N, 128) uint8. Return None if this is impossible.
 
-    Learned descriptors, 64 signed numbers, become their positive and their negative parts. Those of
-    length 1 are multiplied by 512 as in SIFT: rounding loses 1 or 2 of 100 correct matches.
+    A learned descriptor of 64 signed numbers becomes its 64 positive and its 64 negative parts.
+    Unit vectors are multiplied by 512 as in SIFT: rounding loses 1 to 2 % of the correct matches.
     """
     found = keypoints.descriptors
     if found is not None and is_learned(keypoints.descriptor_type):

@@ -24,14 +24,14 @@ COLUMNS = {
     "image": "image imagename imname filename file photo",
     "name": "name gcp gcpname gcpid id label point pointname marker",
 }
-"""The columns in their usual order, of which the last may be missing, and the words that name each
-one in a header, in lower case and without signs."""
+"""Columns of a file of control points in their default order; the last one, `name`, may be missing.
+Each value lists the header words for its column, in lower case and without punctuation."""
 
 
 class ControlRow(NamedTuple):
     """A ground control point in an image. `place` is its latitude, longitude and height.
 
-    `heights` says what heights are measured from; they are in metres, and NaN if unknown.
+    The height is in metres, NaN if unknown. `heights` says what the height is measured from.
     """
 
     name: str
@@ -47,15 +47,15 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
     The first line names the coordinate system, such as "EPSG:32633", "EPSG:2249+6360" or "WGS84 UTM
     33N". Each other line is `x y z column row image [name]`: a point's coordinates, x to the east,
     and its pixel in an image, separated by blanks, tabs, commas or semicolons. A header may state
-    another order. Heights have the unit of the system's vertical axis, else of x and y, or metres
-    if these are degrees.
+    another order. The unit of heights is that of the system's vertical axis; if there is none, that
+    of x and y, or metres if x and y are degrees.
     """
     require_packages("a file of ground control points", "pyproj")
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
         return _parsed(line.strip() for line in lines if line.strip())
     except (OSError, UnicodeError) as error:
-        why = f"({first_line(error)}): check the path, and save it as text in UTF-8"
+        why = f"({first_line(error)}): check the path, and save the file as text in UTF-8"
         raise OptionError(f"{path} cannot be read {why}") from None
     except Exception as error:  # an error of pyproj, or text in place of numbers
         raise OptionError(
@@ -89,8 +89,8 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
     longitude, latitude = flat.transform(x, y)
     known = np.isfinite([longitude, *xy]).all() and (abs(latitude) <= 90).all()
     if not (len(rows) and known and all(row[5] for row in rows)) or np.isinf(z).any():
-        raise ValueError(f"it has no points, or one without an image, or outside of {system}")
-    # Zones are used beyond their borders, so the place may be as far off as the area is large.
+        raise ValueError(f"there are no points, or one lies outside {system} or has no image")
+    # Zones are used beyond their borders, so points may be off by the size of the area of use.
     if area := crs.area_of_use:
         width = (area.east - area.west) % 360 or 360
         aside = np.median((longitude - area.west + width) % 360)
@@ -120,7 +120,7 @@ def _words(line: str) -> list[str]:
 
 
 def _in_order(words: list[str], order: list[str]) -> list[str]:
-    """Sort the words of a line. Names may hold blanks: the last one, and an image to its suffix."""
+    """Sort a line's words by `COLUMNS`. Only the last column and image names may hold blanks."""
     at, last = order.index("image"), len(order) - 1
     ends = (k for k in range(at, len(words)) if words[k].lower().endswith(IMAGE_SUFFIXES))
     end = next(ends, at) + 1

@@ -16,20 +16,20 @@ from .._shared.kernels import compiled
 from ..matching.stereo.kernels import count_bits
 
 HIDDEN = np.uint64(1) << np.uint64(63)
-"""A pixel's census has 62 bits. This higher bit marks pixels that the neighbour does not show."""
+"""A pixel's census transform has 62 bits. Bit 63 marks pixels that the neighbour does not show."""
 
 MIN_TEXTURE = np.float32(0.18)
-"""A window has texture if its gradients along the epipolar line have more than this multiple of the
-noise's variance. Plain skies with JPEG artefacts have less, weathered stone has more."""
+"""A window has texture if the variance of its gradients along the epipolar line exceeds this
+multiple of the noise's variance. Plain skies with JPEG artefacts do not, weathered stone does."""
 
 MIN_GAIN = np.float32(0.2)
-"""The shift of a window is divided by the ratio of its contrast to that of its match in a
-neighbour. Smaller ratios count as this one, so that the shift does not become too large."""
+"""A window's shift is divided by its contrast relative to the matching window of a neighbour.
+Ratios below `MIN_GAIN` are raised to `MIN_GAIN`, so that the shift does not become too large."""
 
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write to `line` (D, W) the sum of the two least Hamming distances, for row `y`."""
+    """Write to `line` (D, W) the two least Hamming distances to neighbours in row `y`, summed."""
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
     for d in range(count):
@@ -78,7 +78,7 @@ def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost)
 
 @compiled(nogil=True)
 def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
-    """Write the index of each pixel's least cost, refined by a parabola, as (H, W) float32."""
+    """Write each pixel's index of least cost, refined by a parabola, to `out`, (H, W) float32."""
     count = total.shape[2]
     for y in range(first, last):
         for x in range(total.shape[1]):
@@ -132,7 +132,7 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
             e, f = siv - si * sv / n, sjv - sj * sv / n
             area = a * c - b * b
             more_right = more_down = 0.0
-            if area > n:  # else the pixels lie on a line, and the slopes stay
+            if area > n:  # else the pixels lie on a line: keep the slopes
                 more_right, more_down = (e * c - f * b) / area, (f * a - e * b) / area
             out[y, x, 0] = w + (sv - more_right * si - more_down * sj) / n
             out[y, x, 1] = right + more_right
@@ -240,9 +240,9 @@ def propagate_rows(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Let each pixel whose window correlates worse than `sure` try the planes of four other pixels.
 
-    These lie `jump` pixels to the right, left, below and above. The pixel takes the plane that
-    correlates best. If `jump` is 0, only its own plane is tested. `scores` are the correlations of
-    the given planes, `found` those of the new ones. For the rest, see `refine_rows`.
+    The four pixels lie `jump` pixels to the right, left, below and above. If `jump` is 0, only the
+    pixel's own plane is tested. The plane that correlates best is taken. `scores` are correlations
+    of the given planes, `found` those of the new planes. Other arguments are as in `refine_rows`.
     """
     height, width = gray.shape
     rows, columns = planes.shape[:2]
@@ -288,7 +288,7 @@ def refine_rows(  # type: ignore[no-untyped-def]
     window is compared if its inverse depth is within `tolerance` of the middle pixel's plane.
 
     The new inverse depth `out` is NaN if fewer than `min_number` neighbours reach
-    `min_correlation`. It is the old one if they have no texture along the epipolar line. In both
+    `min_correlation`, and unchanged if these have no texture along the epipolar line. In both
     cases, `certainty` is 0. `errors` are root mean square distances, in pixels, from the match at
     the new inverse depth to the matches that each neighbour alone would give.
     """
@@ -350,9 +350,9 @@ def fuse_rows(  # type: ignore[no-untyped-def]
 
     A neighbour agrees if its own surface point reprojects to within `max_error` pixels of the
     pixel, and its inverse depth differs by at most the fraction `max_difference`. `views` (H, W)
-    counts the images that agree, `shown` (H, W) those whose frame contains the point. Both include
-    the first image. If no agreeing line of sight differs by `min_angle` radians from the first
-    image's, `views` is 0.
+    counts the images that agree, `shown` (H, W) the images whose frame contains the point. Both
+    counts include the first image. `views` is 0 unless the line of sight of some agreeing image
+    differs by `min_angle` radians from that of the first image.
     """
     for row in range(first, last):
         for column in range(planes.shape[1]):
@@ -397,11 +397,11 @@ def fuse_rows(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def support_rows(first, last, planes, stride, chosen, reach, spacing, tolerance, support):  # type: ignore[no-untyped-def]
-    """Write, per pixel, the fraction of the pixels around it that are `chosen` and on its surface.
+    """Write the fraction of each pixel's neighbourhood that is `chosen` and on the pixel's surface.
 
-    The pixels around it, with itself, are every `spacing`-th one, up to `reach` in both directions.
-    `chosen` (H, W) is a mask, and `planes` are as in `refine_rows`. Pixels are on the surface if
-    they differ in inverse depth from the middle pixel's plane by at most the fraction `tolerance`.
+    The neighbourhood is every `spacing`-th pixel up to `reach` away, the pixel itself included.
+    `chosen` (H, W) is a mask, and `planes` are as in `refine_rows`. A pixel is on the surface if
+    its inverse depth differs from the middle pixel's plane by at most the fraction `tolerance`.
     """
     height, width = chosen.shape
     for row in range(first, last):

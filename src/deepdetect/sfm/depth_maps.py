@@ -26,68 +26,68 @@ from .colmap import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel
 
 MATCHED_NEIGHBOURS, NEIGHBOURS, MIN_COMMON_POINTS = 4, 8, 30
-"""An image is matched with at most the first number of neighbours, because each takes time. Its
-depth map is compared with those of at most the second number. A neighbour must share at least the
-third number of sparse points with it. Chosen by hand."""
+"""An image is matched with at most `MATCHED_NEIGHBOURS` neighbours, because each takes time. Its
+depth map is compared with those of at most `NEIGHBOURS` neighbours. A neighbour must share at least
+`MIN_COMMON_POINTS` sparse points with the image. Chosen by hand."""
 
 IDEAL_ANGLE_DEG, MAX_ANGLE_DEG = 5.0, 30.0
 """Neighbours are ranked by the sparse points that they share with the image. A point whose two
-lines of sight form a smaller angle counts less, because its depth is uncertain, and one with a
-larger angle, because surfaces look different. Chosen by hand."""
+lines of sight form less than `IDEAL_ANGLE_DEG` counts less, because its depth is uncertain, as does
+a point above `MAX_ANGLE_DEG`, because surfaces then look different. Chosen by hand."""
 
 MAX_SIDE_PX, CACHED_IMAGES = 2000, 16
-"""Images whose longer side exceeds this are scaled down to it, which limits time and memory. A
-process caches this number of undistorted images, because successive images share neighbours."""
+"""Images whose longer side exceeds `MAX_SIDE_PX` are scaled down to it, to limit time and memory. A
+process caches `CACHED_IMAGES` undistorted images, because successive images share neighbours."""
 
 SMALL_SCALE, MAX_VOLUME = 0.5, 3e7
-"""Images are scaled by at most this for semi-global matching, because halving it divides the time
-by 8, and have at most this number of costs (pixels times inverse depths) there, to save memory."""
+"""Semi-global matching scales images by at most SMALL_SCALE (half the scale takes 1/8 of the time).
+It uses at most MAX_VOLUME costs (pixels times inverse depths), to save memory."""
 
 TAIL_FRACTION, DEPTH_MARGIN, MIN_FAR = 0.002, 0.2, 0.1
-"""The search range spans the inverse depths of the sparse points, without a `TAIL_FRACTION` at each
-end, which may be wrong. It is then extended at each end by `DEPTH_MARGIN` times its length, but not
-below `MIN_FAR` times the smallest inverse depth, so that it stays above 0. Chosen by hand."""
+"""The search range spans the inverse depths of the sparse points, except for `TAIL_FRACTION` of
+them at each end, which may be wrong. The range is then extended at each end by `DEPTH_MARGIN` times
+its length, but not below `MIN_FAR` times the smallest inverse depth. Chosen by hand."""
 
 MAX_APPROACH = 0.5
-"""The search aligns all images at one depth of the first image. The depth is so large that no other
-camera has moved ahead by more than this fraction of it. Chosen by hand."""
+"""The search aligns all images at one depth in the first image. This depth is so large that no
+other camera has moved ahead by more than this fraction of it. Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
-"""One step of inverse depth in the search moves a match by one pixel, at this quantile of all
-matches. It is the median, because matches near the epipole hardly move."""
+"""The search steps through inverse depths so that matches move by one pixel per step, at this
+quantile of all matches: the median, because matches near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
 """Two inverse depths belong to one surface if their matches in the downscaled images of the search
 are at most this far apart."""
 
 FIT_RADIUS_PX, FIT_TOLERANCES_PX, MIN_FITTED = 3, (4, 2, 1), 12
-"""Planes are fitted to the downscaled depth map three times, in windows of this radius, to at least
-`MIN_FITTED` pixels, as smaller patches are wrong. The first tolerance, in steps of the search, is
-wide, so that planes that begin frontal can become as steep as the ground. Chosen by hand."""
+"""Planes are fitted to the downscaled depth map three times, in windows of radius `FIT_RADIUS_PX`,
+with tolerances in steps of the search: first a wide one, so that frontal planes can become as steep
+as the ground. Fits to under `MIN_FITTED` pixels are dropped as wrong. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
 """Radius of the compared windows, and spacing of the pixels read in them. Chosen by hand."""
 
 BLUR_SIGMA_PX, NOISE_LEVELS = 1.0, 1.0
-"""Sigma of the blur that lets the pixels read in a window represent those between them, and assumed
-noise of a pixel in grey levels: weaker gradients move no depth. Chosen by hand."""
+"""A blur of BLUR_SIGMA_PX lets the pixels read in a window represent the pixels between them. Noise
+of NOISE_LEVELS grey levels is assumed: weaker gradients move no depth. Chosen by hand."""
 
 JUMPS = (16, 8, 4, 2, 1)
-"""A pixel tries the planes of pixels at this distance in the depth map, one distance in each of
+"""A pixel tries the planes of pixels at these distances in the depth map, one distance in each of
 five passes. A plane can thus spread over 31 pixels."""
 
 SURE_CORRELATION, MIN_CORRELATION = 0.9, 0.5
-"""A pixel whose window correlates this well tries no other plane, to save time. A neighbour refines
-a depth only if the windows correlate at least as well as the second value. Chosen by hand."""
+"""A pixel whose window correlates by SURE_CORRELATION or more tries no other plane, to save time. A
+neighbour refines a depth only if windows correlate by MIN_CORRELATION or more. Chosen by hand."""
 
 SMOOTHING_RADII, MIN_WEIGHT = (4, 3), 0.02
-"""Planes are refined twice, and each time smoothed by a fit in windows of this radius, in pixels of
-the depth map. There untextured pixels have the second value as weight, and half of the textured
-ones more than 0.5. Chosen by hand."""
+"""Planes are refined twice, and each time smoothed by a fit in windows of these radii, in pixels of
+the depth map. In the fit, untextured pixels have the weight `MIN_WEIGHT`, and half of the textured
+pixels have weights above 0.5. Chosen by hand."""
 
 MIN_VIEWS = 3
 """A depth is kept if at least this number of images agree on it, its own included: a third image
-confirms two. `fusion` asks for other numbers in some places, such as depth edges."""
+confirms the first two. Some places, such as depth edges, have other limits (see `fusion`)."""
 
 DEPTH_PIXEL = np.dtype(
     [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True
@@ -129,7 +129,7 @@ def depth_map(
     """Match the first image with the others; return its depth map, (H, W) `DEPTH_PIXEL`.
 
     The map has a pixel for every `stride_px`-th pixel of the image in each direction. The search
-    covers the depths of those of the sparse model's `points` (N, 3) that the first image shows.
+    covers the depths of the sparse model's `points` (N, 3) that the first image shows.
     """
     rgbs, views = zip(*(prepared_image(folder, image) for image in images), strict=True)
     grays = [luma(rgb) for rgb in rgbs]
@@ -216,7 +216,7 @@ def _search(
 def _warped_census(
     gray: np.ndarray, warp: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
-    """Return the census of an image warped by a homography, `HIDDEN` where the image ends.
+    """Return the census of an image warped by a homography, with `HIDDEN` outside the image.
 
     `first` and `last` are the upper left and the lower right pixel (x, y) of the warped image.
     """
@@ -305,7 +305,7 @@ def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: f
 
 
 def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return a mask of `known` pixels and of the pixels below until a new surface `begins`."""
+    """Return a mask of `known` pixels and the pixels below each, until a new surface `begins`."""
     rows = np.arange(len(known))[:, None]
     last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
     return last >= first
@@ -323,13 +323,13 @@ def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray
 def relative_projections(
     first: PosedView, others: Sequence[PosedView], back: bool = False
 ) -> np.ndarray:
-    """Return A and b side by side, (K, 3, 4), from the first view to K others, or `back` to it."""
+    """Return A and b of `relative_projection` as (K, 3, 4), from the first view or `back` to it."""
     pairs = [(other, first) if back else (first, other) for other in others]
     return np.array([np.column_stack(relative_projection(*pair)) for pair in pairs])
 
 
 def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> float:
-    """Return how far matches move, in pixels per unit of inverse depth, at an inverse depth."""
+    """Return how far the median match moves, in pixels per unit of inverse depth, at a depth."""
     matrix, vector = relative_projection(first, second)
     x, y = (np.linspace(0, side - 1, 7)[1:-1] for side in first.camera.size)
     pixels = np.array([[across, down, 1] for across in x for down in y])
@@ -354,7 +354,7 @@ def _undistorted(
     camera: Camera,
     how: ReadingOptions,
 ) -> np.ndarray:
-    """Read and undistort an image. A changed file has another `state`, so the cache misses it."""
+    """Read and undistort an image. `state` changes with the file, which renews the cache."""
     rgb = load_image(path, max_megapixels=np.inf)
     if camera.size != intrinsics.size:
         rgb = cv2.resize(rgb, camera.size, interpolation=cv2.INTER_AREA)

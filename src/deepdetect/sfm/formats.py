@@ -1,4 +1,4 @@
-"""Write a model in further formats: point clouds and maps in UTM, meshes, and inputs for splats."""
+"""Write a model as point clouds and maps in UTM, meshes, or inputs for Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ LAZ_STEP_M = 0.001
 """Coordinates in LAZ files are rounded to multiples of this, in metres."""
 
 MESH_MARGIN, MESH_DEPTHS, MESH_TRIM = 0.5, (6, 12), 3
-"""A mesh takes points in their robust box, extended on each side by `MESH_MARGIN` of its size. The
-depth of its octree is between `MESH_DEPTHS`, and the surface is cut away where the octree is over
-`MESH_TRIM` levels coarser. Chosen by hand."""
+"""A mesh uses the points in their robust bounding box, extended on each side by `MESH_MARGIN` of
+its size. `MESH_DEPTHS` limits the depth of its octree. Surfaces are trimmed where the octree is
+more than `MESH_TRIM` levels coarser. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
 """A mesh needs this number of points: with only a handful, COLMAP's meshing crashes the process."""
@@ -163,7 +163,7 @@ class Format(NamedTuple):
     write: Callable[[MultiViewReconstruction, Path, Path], None]
     files: tuple[str, ...]
     packages: tuple[str, ...] = ()
-    placed: bool = False  # whether it needs a georeferenced model
+    placed: bool = False  # whether the format needs a georeferenced model
 
 
 FORMATS: dict[FormatName, Format] = {

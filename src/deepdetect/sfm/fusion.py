@@ -14,32 +14,32 @@ from ..geometry.camera import PosedView
 from .depth_maps import MIN_VIEWS, relative_projections
 
 MAX_ERROR_PX, MAX_DEPTH_DIFFERENCE = 1.0, 0.01
-"""A neighbour agrees with a pixel's depth if its own surface point reprojects to within this
-distance of the pixel, where COLMAP's fusion allows 2 px, and its inverse depth differs by at most
-this fraction, as in COLMAP."""
+"""A neighbour agrees with a pixel's depth if its own surface point reprojects to within
+`MAX_ERROR_PX` of the pixel (2 px in COLMAP's fusion), and its inverse depth differs by at most the
+fraction `MAX_DEPTH_DIFFERENCE` (as in COLMAP)."""
 
 MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
-"""A pixel becomes a point if `ENOUGH_VIEWS` images agree on its depth, or if all images whose frame
-contains the point agree and are at least `MIN_ALL_VIEWS`. Chosen by hand."""
+"""A pixel becomes a point if `ENOUGH_VIEWS` images agree on its depth, or if at least
+`MIN_ALL_VIEWS` images contain the point in their frame and all of them agree. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
 """Pixels on the near side of a depth edge, up to this distance from it, must satisfy the rule for
-`ENOUGH_VIEWS`: windows give the background there the depth of the foreground. Chosen by hand."""
+`ENOUGH_VIEWS`: near edges, windows give the background the foreground's depth. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
 """A pixel in the middle of a surface needs only `MIN_VIEWS` images that agree, because most wrong
 points are on small patches. A pixel is in the middle if, of 5 x 5 pixels `MIDDLE_SPACING_PX` apart,
-at least `MIN_MIDDLE_SHARE` lie on its surface and have as many images that agree. Chosen by
-hand."""
+at least the fraction `MIN_MIDDLE_SHARE` lie on its surface and also have `MIN_VIEWS` images that
+agree. Chosen by hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
 """Pixels within `FILLED_RADIUS_PX` of the middle of their surface need only `MIN_FILLED_VIEWS`
-images that agree, because other images may not show this part of it. Chosen by hand."""
+images that agree, because other images may not show this part of the surface. Chosen by hand."""
 
 MIN_TRIANGULATION_DEG, DUPLICATE_DEPTH = 1.0, 0.01
-"""A point is kept only if the line of sight of at least one image that agrees on it differs by this
-angle from that of the reference image, and if no earlier point projects to the same pixel with a
-depth that differs by at most the fraction. Chosen by hand."""
+"""A point is kept only if the lines of sight of the reference image and of some image that agrees
+form at least `MIN_TRIANGULATION_DEG`, and no earlier point projects to the same pixel with a depth
+that differs by at most the fraction `DUPLICATE_DEPTH`. Chosen by hand."""
 
 DENSE_POINT = np.dtype(
     [
@@ -51,7 +51,7 @@ DENSE_POINT = np.dtype(
     ]
 )
 """A dense point, from a pixel of a depth map. `normals` is a unit vector facing the map's camera,
-`errors` the `error` of `DEPTH_PIXEL`, `colors` sRGB, `views` the number of images that agree."""
+`errors` is `error` of `DEPTH_PIXEL`, `colors` is sRGB, `views` the number of images that agree."""
 
 
 def fuse_depth_maps(

@@ -33,19 +33,19 @@ from .mapping import SparseModel
 __all__ = ["ControlRow", "Georeference", "Origin", "georeference", "read_control_points"]
 
 GPS_ACCURACY_M, CONTROL_ACCURACY_M = 3.0, 0.1
-"""Assumed accuracies: of GPS positions that state none, as usual receivers reach it in the open,
-and of control points, surveyed to centimetres and marked to within a few pixels."""
+"""Assumed accuracies: of GPS positions that state none, typical of receivers in the open, and of
+control points, which are surveyed to centimetres and marked to within a few pixels."""
 
 MAX_SCALE_STD, MAX_HEADING_STD_DEG = 0.25, 20.0
-"""The relative standard deviation of a georeferenced model's scale, and the standard deviation of
-its direction to north, are below these. Chosen by hand."""
+"""A model is georeferenced only if the relative standard deviation of its scale, and the standard
+deviation of its direction to north, are below these. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""A note is made if the positions leave the rotation about an axis less certain than this."""
+"""A note is made if the positions alone leave a rotation about any axis less certain than this."""
 
 GRAVITY_STD_DEG, UPRIGHT_STD_DEG, AHEAD_STD_DEG = 2.0, 5.0, 25.0
-"""Assumed standard deviations of a gimbal's angles, and without a gimbal of image rows and of the
-mean of all optical axes from level. Chosen by hand."""
+"""Assumed standard deviations: of a gimbal's angles; without a gimbal, of image rows from level,
+and of the mean of all optical axes from level. Chosen by hand."""
 
 DOWNWARD_SHARE = 0.1
 """Without a gimbal, "down" is first taken as the mean direction of the image columns plus this
@@ -56,19 +56,19 @@ MAX_DISTANCE_PX = 15.0
 of the given pixel. Chosen by hand."""
 
 MAX_BEND = 0.05
-"""A bent model has residuals of up to this share of the extent of its points. Chosen by hand."""
+"""Residuals above this fraction of the control points' extent are not a bend. Chosen by hand."""
 
 READINGS: dict[str, tuple[list[int], float]] = {
     "heights are in feet": ([0, 1, 2], 0.3048),
     "heights are in metres": ([0, 1, 2], 1 / 0.3048),
     "x and y are exchanged": ([1, 0, 2], 1),
 }
-"""Mistakes that leave coordinates plausible: the order of the axes and the factor of the heights
-that correct each one."""
+"""Mistakes in control points that leave them plausible, each with its correction: the order of the
+axes, and the factor of the heights."""
 
 CAUSES = "the units, the order of the columns, the coordinate system, and the names of the images"
 
-NEARLY_A_LINE = "the positions lie nearly on a line: that the cameras are held upright is assumed"
+NEARLY_A_LINE = "the positions lie nearly on a line: the cameras are assumed to be upright"
 
 
 @dataclass(frozen=True)
@@ -104,12 +104,12 @@ class Georeference:
     Attributes:
         similarity: similarity from the frame of the mapping to the world.
         source: "GPS", "ground control points", or "known distance", which gives only a scale.
-        origin: that of the world, whose axes point east, north and up; None for a known distance.
+        origin: origin of the world frame (east, north, up); None for a known distance.
         residuals: given position minus position in the model, (3,) in metres east, north and up, by
             name of the image (GPS) or of the control point.
         wrong: images or control points that were left out, because they contradict the others.
         fit: the fitted similarity with its uncertainty; None for a known distance.
-        heights: what heights are measured from, such as "above sea level"; none are converted.
+        heights: what heights are measured from, such as "above sea level"; they are kept as given.
     """
 
     similarity: Similarity
@@ -159,10 +159,10 @@ def georeference(
     """Find the scale and place of a model, or return a sentence on why even the scale is unknown.
 
     `points` (N, 3) are the dense points, and `folder` holds the images. Ground control points are
-    used instead of GPS, and a known distance, as in `MultiViewOptions`, alone determines the scale.
+    used instead of GPS. A known distance (see `MultiViewOptions`) alone determines the scale.
 
     Raises:
-        OptionError: an end of the distance is not in the model, or it has too few control points.
+        OptionError: an end of the distance is not in the model, or control points are too few.
         NoPlaceError: the control points contradict the model.
     """
     scale = None
@@ -193,7 +193,7 @@ def require_images(
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
-    """Raise an OptionError if `scale_by` names no image, or images show too few control points."""
+    """Raise an OptionError if `scale_by` names an unknown image, or control points are too few."""
     named = _by_file_name(names)
     if control is not None:
         _seen_by_several(control, named)
@@ -228,9 +228,9 @@ def georeference_by_gps(
 
 
 def _altitudes(fixes: Sequence[GpsFix]) -> tuple[str, np.ndarray]:
-    """Return what most altitudes (N,) are measured from, and these; NaN for all others.
+    """Return the zero level of most altitudes, and the (N,) altitudes; NaN for other levels.
 
-    Each flight may have its own take-off point, so heights above it count only if all have one.
+    Heights above take-off are used only if all images state one, as take-off points may differ.
     """
     table = {name: np.full(len(fixes), np.nan) for name in (TAKE_OFF, SEA_LEVEL, ELLIPSOID)}
     for k, fix in enumerate(fixes):
@@ -252,7 +252,7 @@ def _place(
     scale: float | None,
     error: float | None = None,
 ) -> Georeference:
-    """Fit a model to places; `error` is that of control points in the model, in its unit."""
+    """Fit a model to places; `error` is the error of control points in units of the model."""
     unknown = np.isnan(places[:, 2])
     places = np.where(np.isnan(places), 0 if unknown.all() else np.nanmedian(places[:, 2]), places)
     places[:, 1] = np.unwrap(places[:, 1], period=360)
@@ -286,10 +286,10 @@ def _check_control_points(
     error: float,
     known: Mapping[str, Any],
 ) -> None:
-    """Raise a NoPlaceError if control points contradict a model, or fit better if read otherwise.
+    """Raise a NoPlaceError if control points contradict a model, or may be misread (`READINGS`).
 
-    They contradict it if most residuals exceed what the accuracy of the targets, the `error` of the
-    points in the model, and a bend of the model explain. A bend is told.
+    They contradict the model if most residuals exceed what the accuracy of the targets, the `error`
+    of the points in the model, and a bend of the model explain. A bend causes a warning.
     """
     own, names = np.array([*points.values()]), [*points]
 
@@ -303,7 +303,7 @@ def _check_control_points(
         away, relative, cost = misfit(fit)
         for k in np.argsort(-away)[:MIN_POINTS]:
             worst += f", {names[k]} by {away[k]:.3g} m"
-        # Three points always agree, so more than these must outnumber those that do not.
+        # Three points always agree, so at least three more must agree than disagree.
         few = 2 * (relative > WRONG_STDS).sum() <= len(names) - MIN_POINTS
         agreed = few and np.median(relative) < WRONG_STDS
         bent = cost > len(names) and _is_bent(fit, targets)
@@ -323,7 +323,7 @@ def _check_control_points(
 def _is_bent(fit: SimilarityFit, targets: np.ndarray) -> bool:
     """Return whether a bend that grows with the squared distance explains most residuals.
 
-    Each point is compared with what the others predict, so errors at random are no bend.
+    Each point is compared with a prediction from the others, so random errors are not a bend.
     """
     known = np.isfinite(targets[:, 2])
     at, residuals = targets[known], fit.residuals[known]
@@ -346,10 +346,10 @@ def _is_bent(fit: SimilarityFit, targets: np.ndarray) -> bool:
 def upright(
     views: Mapping[str, PosedView], gravities: Mapping[str, np.ndarray | None] = {}
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the unit vector up (3,), and `level` (L, 3) and `level_stds` of `fit_similarity`.
+    """Return the unit vector up (3,), and `fit_similarity`'s arguments `level` and `level_stds`.
 
-    If a gimbal reports gravity, directions perpendicular to it are level. Otherwise, image rows
-    and, less certainly, optical axes are assumed to be level.
+    If a gimbal reports gravity, directions perpendicular to gravity are level. Otherwise, image
+    rows and, less certainly, optical axes are assumed to be level.
     """
     level, stds, down = [], [], []
     for name, view in views.items():
@@ -389,8 +389,8 @@ def _seen_by_several(
 ) -> dict[str, dict[str, ControlRow]]:
     """Return the control points marked in two or more of the images, by name, then by image.
 
-    `names` maps image names in the file to full names. One place is one point, because remarks on
-    the mark may follow its name.
+    `names` maps image names in the file to full names. Rows with equal places are one point even if
+    their names differ, because remarks on the mark may follow a name.
     """
     rows: dict[str, dict[str, ControlRow]] = {}
     place_of: dict[str, str] = {}
@@ -399,7 +399,7 @@ def _seen_by_several(
             place = str(row.place)  # as text, NaN is equal to itself
             rows.setdefault(place, {})[names[row.image]] = row
             if place_of.setdefault(row.name, place) != place:
-                raise NoPlaceError(f"{row.name} is the name of two control points: change one")
+                raise NoPlaceError(f"{row.name} is the name of two control points: rename one")
     seen = {next(iter(each.values())).name: each for each in rows.values() if len(each) > 1}
     if len(seen) < MIN_POINTS:
         raise OptionError(

@@ -1,4 +1,4 @@
-"""Estimate all poses and the sparse points by COLMAP's mapping and a last bundle adjustment.
+"""Estimate all poses and the sparse points by COLMAP's mapping and a final bundle adjustment.
 
 Incremental mapping: Schönberger and Frahm, "Structure-from-Motion Revisited", 2016. Global mapping:
 Pan, Baráth, Pollefeys and Schönberger, "Global Structure-from-Motion Revisited", 2024.
@@ -24,28 +24,28 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
 MIN_VERIFIED = 30
-"""A pair of images is used only if its two-view geometry has at least this number of inliers. Some
+"""A pair of images is used only if its two-view geometry has at least this number of inliers. About
 20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
 
 MAX_VERIFICATION_ERROR_PX, MAX_TRIALS = 4.0, 5000
-"""An inlier has at most this geometric error (COLMAP's default). RANSAC draws at most MAX_TRIALS
-samples: with COLMAP's 10,000, pairs of different places would take longer than the mapping."""
+"""An inlier's error is at most MAX_VERIFICATION_ERROR_PX (COLMAP's default). RANSAC draws at most
+MAX_TRIALS samples: with COLMAP's 10,000, unrelated pairs would take longer than the mapping."""
 
 MIN_VIEWS = 3
-"""A model needs at least this number of images. The function `reconstruct` is for two."""
+"""A model needs at least this number of images. For two images, there is `reconstruct`."""
 
 MAX_MODELS, MAX_FIRST_PAIRS = 5, 20
-"""Unconnected groups of images become at most MAX_MODELS models, for each of which at most
-MAX_FIRST_PAIRS are tried as its first pair. Chosen by hand."""
+"""Unconnected groups of images become at most MAX_MODELS models. For each model, at most
+MAX_FIRST_PAIRS pairs of images are tried as the first pair. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
 """The mapping begins with two images whose lines of sight form 16 degrees, and between which the
-camera did not move straight ahead, as in COLMAP. If there is no such pair, or more connected images
-are left out than mapped, a retry allows such motion and angles down to this. Chosen by hand."""
+camera did not move straight ahead, as in COLMAP. If no pair qualifies, or more connected images are
+left out than mapped, a retry allows forward motion and angles down to this. Chosen by hand."""
 
 ROBUST_SCALE_PX, MAX_REFINED_ERROR_PX = 1.0, 1.0
-"""The scale of the Cauchy loss in bundle adjustment was chosen by hand. Observations of refined
-tracks with errors above the second show something else and are removed."""
+"""`ROBUST_SCALE_PX` is the scale of the Cauchy loss in bundle adjustment, chosen by hand. In
+refined tracks, observations with errors above `MAX_REFINED_ERROR_PX` are removed as wrong."""
 
 ROUGH_TOLERANCE, TOLERANCE = 1e-6, 1e-8
 """Bundle adjustment ends when a step reduces the cost by less than this fraction. `ROUGH_TOLERANCE`
@@ -53,22 +53,22 @@ is used before wrong observations are removed. Smaller tolerances move cameras b
 of their error, and take four times as long."""
 
 MIN_ANGLE_DEG = 1.0
-"""Two lines of sight to each point must form this angle. Chosen by hand; COLMAP asks for 1.5."""
+"""Two lines of sight to each point must form at least this angle (COLMAP: 1.5). Chosen by hand."""
 
 MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION = 0.1, 10.0, 1.0
-"""COLMAP's limits for plausible cameras: the first two for the focal length divided by the longer
-side, the third for the absolute values of the distortion parameters."""
+"""COLMAP's limits for plausible cameras: for the ratio of the focal length to the image's longer
+side, and for the absolute values of the distortion parameters."""
 
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
 """Principal points are estimated only if each camera took at least this number of images.
 Otherwise, they are the middle of the image. Chosen by hand."""
 
 USUAL_DISTORTION = 0.05
-"""A lens is looked at if it moves the corners inwards by more than this part of their distance:
-SLRs stay below it, fisheyes of 100 degrees reach 0.14."""
+"""A lens may be a fisheye if it moves the image corners inwards by more than this fraction of their
+distance from the centre. SLRs stay below this, fisheyes of 100 degrees reach 0.14."""
 
 LENSES = {"RADIAL": (0.0, 0.0), "RADIAL_FISHEYE": (1 / 3, 2 / 15)}
-"""Models of equal size, and what is added to the distortion of a pinhole: the series of tan(x)."""
+"""Camera models to compare, and what is added to a pinhole's distortion: the series of tan(x)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +112,9 @@ class SparseModel:
 
 
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
-    """Store the two-view geometries of matched pairs; return the inliers of the verified pairs.
+    """Store the two-view geometries of matched pairs; return the inlier count by verified pair.
 
-    These have at least `MIN_VERIFIED`, not only on what stands still at the border, a watermark.
+    Verified pairs have at least `MIN_VERIFIED` inliers, not only on a watermark at the border.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_VERIFIED)
@@ -144,7 +144,7 @@ def map_images(
     """Estimate the poses of connected images one after the other, from verified pairs.
 
     With `known_cameras`, all intrinsics stay fixed. `registered` gets the number of images just
-    added. Returns the largest `pycolmap.Reconstruction`, and the names of the images in each other.
+    added. Returns the largest `pycolmap.Reconstruction`, and the image names of each other model.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
@@ -200,7 +200,7 @@ def map_globally(
 
 
 def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
-    """Return the models, largest first, unless estimated cameras diverged for lack of points."""
+    """Return the models, largest first, except those in which most cameras became implausible."""
     limits, found = (MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION), []
     for model in models.values():
         cameras = [model.images[number].camera for number in model.reg_image_ids()]
@@ -211,7 +211,7 @@ def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
 
 
 def _largest(found: Sequence[Any], tried: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
-    """Return the first of the sound models `found`, and the names of the images in each other."""
+    """Return the first of the sound models `found`, and the image names of each other model."""
     if not found and any(_size(model) >= MIN_VIEWS for model in tried):
         raise NoDepthError(
             "focal length and distortion cannot be estimated from these images: give `calibration` "
@@ -261,7 +261,7 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
 
 
 def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> None:
-    """Bundle-adjust a model robustly. The log of pycolmap's own function cannot be turned off."""
+    """Bundle-adjust a model with a robust loss, and without the log of pycolmap's own function."""
     taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     enough = min(taken.values()) >= MIN_VIEWS_OF_PRINCIPAL_POINT
     with quiet_pycolmap() as pycolmap:
@@ -293,7 +293,7 @@ def adjust_refined(model: Any, known_cameras: bool) -> None:
 
 
 def require_pinholes(model: Any) -> None:
-    """Raise a NoDepthError if a fisheye fits a model of "SIMPLE_RADIAL" cameras better."""
+    """Raise a NoDepthError if fisheye lenses fit better than a model's "SIMPLE_RADIAL" cameras."""
     costs = []
     for name, added in LENSES.items():
         with quiet_pycolmap() as pycolmap:
@@ -312,12 +312,12 @@ def require_pinholes(model: Any) -> None:
     pinhole, fisheye = (np.array([each[n] for n in common]) for each in costs)
     if deviations(pinhole, fisheye) > MIN_DEVIATIONS:
         raise NoDepthError(
-            f"a fisheye took these images, which no pinhole geometry fits: {UNDISTORT}"
+            f"these images are from a fisheye lens, which no pinhole geometry fits: {UNDISTORT}"
         )
 
 
 def normalise_model(model: Any) -> None:
-    """Make the camera that sees most points the frame of a model, and `camera_spacing` its unit."""
+    """Use the camera that sees most points as a model's frame, `camera_spacing` as its unit."""
     sparse = read_sparse_model(model)
     view = max(sparse.images.values(), key=lambda image: len(image.points)).view
     centres = np.array([each.centre for each in sparse.views.values()])

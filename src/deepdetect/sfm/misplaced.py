@@ -1,7 +1,7 @@
 """Find and correct images to which the mapping gave a wrong pose.
 
 If the camera moves straight ahead, an image that is registered early, by few points, may get a
-wrong place on the path. Only points whose depth comes from other images then show the error.
+wrong place on the path. Only points whose depth comes from other images reveal this error.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
 mean square). Otherwise, its depth came from the tested image itself."""
 
 MIN_GAIN = 1.5
-"""An image is moved if the number of points that agree with a pose grows at least by this factor.
+"""An image is moved to a new pose if the number of points that agree grows at least by this factor.
 The factor was within 1 % of 1 for images in their right place, and 3 or more for misplaced ones."""
 
 MAX_ROUNDS = 3
-"""Images are checked in at most this number of rounds: corrected ones then improve the points."""
+"""Images are checked in at most this number of rounds: corrected images improve the points."""
 
 MIN_KEPT = 0.9
 """A correction is undone if less than this fraction of the observations is left when all points are
@@ -45,7 +45,7 @@ def correct_places(
 ) -> Any:
     """Return a `pycolmap.Reconstruction` in which misplaced images have been moved to better poses.
 
-    `database` is that of the mapping. After a move, all points are triangulated and adjusted again.
+    `database` was used for mapping. After a move, all points are triangulated and adjusted again.
     """
     for _ in range(MAX_ROUNDS):
         with quiet_pycolmap() as pycolmap:
@@ -100,8 +100,8 @@ def _better_places(
 class _Points:
     """The points of a model, and which keypoints of which images see them.
 
-    `xyz` (P, 3) are positions. By image number, `keypoints` (K, 2) are pixels, and `seen` (K,) are
-    the indices of the points that they see, or -1.
+    `xyz` (P, 3) are positions of points. For each image number, `keypoints` holds (K, 2) pixels,
+    and `seen` the (K,) indices of the points that these keypoints see, or -1.
     """
 
     def __init__(self, model: Any) -> None:
@@ -126,7 +126,7 @@ class _Points:
     def matched(
         self, number: int, matches: Iterable[tuple[int, np.ndarray]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return indices of an image's keypoints, and of their points with depth from others.
+        """Return indices of an image's keypoints, and of their points with depth from other images.
 
         `matches` are other images, each with (M, 2) indices of matching keypoints in both images.
         """
@@ -134,7 +134,7 @@ class _Points:
         counts, sums = self._counts.copy(), self._sums.copy()
         counts[own] -= 1
         sums[own] -= sights
-        # The wider unit vectors spread, the shorter is their mean.
+        # The more widely unit vectors spread, the shorter their mean is.
         lengths = np.linalg.norm(sums, axis=1) / np.maximum(counts, 1)
         well = (counts > 1) & (lengths < np.cos(np.radians(MIN_SPREAD_DEG)))
         found = [np.empty(0, np.int64)]

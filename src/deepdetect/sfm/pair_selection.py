@@ -9,8 +9,8 @@ import numpy as np
 from ..batch.pair_list import Pair
 
 MIN_MATCHED = 0.5
-"""Two images may show the same things only if at least this fraction of the keypoints is matched,
-in the image that has fewer keypoints. Chosen by hand."""
+"""Two images can count as nearly the same only if, in the image with fewer keypoints, at least this
+fraction of the keypoints is matched. Chosen by hand."""
 
 
 def largest_component(pairs: Sequence[Pair]) -> int:

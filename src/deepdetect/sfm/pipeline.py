@@ -1,7 +1,7 @@
 """Reconstruct the cameras, sparse points and dense points of many images.
 
 Features and matches come from `batch`, poses from COLMAP. The results of each stage are kept in the
-output folder. So the same call continues an interrupted run, even if images have been added.
+output folder, so the same call continues an interrupted run, even if images have been added.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from .splat import write_transforms
 from .stages import WORK, MultiViewOptions, Stages, check_images
 
 MIN_KEYPOINTS, MAX_KEYPOINTS = 15, 8192
-"""Images with fewer keypoints are left out, because they cannot be matched. By default, an image
-gets at most the second number. Chosen by hand."""
+"""Images with fewer keypoints than `MIN_KEYPOINTS` are left out, because they cannot be matched. By
+default, at most `MAX_KEYPOINTS` are detected in an image. Chosen by hand."""
 
 
 @suggest_keywords
@@ -104,7 +104,7 @@ def reconstruct_many(
     target = Path(output)
     control = _check_arguments(images, target, calibration, focal_px, options)
     detector = PointDetector(MAX_KEYPOINTS) if detector is None else detector
-    if overwrite and any((target / WORK).glob("features.h5*")):  # else another program's folder
+    if overwrite and any((target / WORK).glob("features.h5*")):  # not a folder of another program
         shutil.rmtree(target / WORK, ignore_errors=True)
     stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
@@ -270,7 +270,7 @@ def _write(
     }
     save_point_cloud(found.cloud, output / "model.ply", notes)
     save_point_cloud(found.cloud, output / "model.glb", notes)
-    # The page shows the points and cameras in the frame of the reference.
+    # The page shows points and cameras in the frame of the reference image's camera.
     view, cloud = found.views[found.reference], found.cloud
     points = cloud.points @ view.rotation.T + view.translation
     page = PointCloud(points, cloud.colors, cloud.unit, f"camera of {view.name}")

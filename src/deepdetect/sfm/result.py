@@ -34,7 +34,7 @@ class MultiViewReconstruction:
         unregistered: reasons why the other images are not registered, by name.
         components: groups of unregistered images that are connected with each other, as tuples of
             names, the largest group first. Each group can be reconstructed by itself.
-        reference: name of the image that sees most points.
+        reference: name of the image that sees the most points.
         georeference: scale and place of the model, or a sentence on why they are unknown.
         sparse: points from which the poses were estimated.
         sparse_errors: (N,) float32 mean reprojection errors of these points in pixels.
@@ -47,8 +47,8 @@ class MultiViewReconstruction:
         matched: number of verified matches, by pair.
         pairs: number of pairs that were matched.
         pair_choice: how the pairs were chosen, such as "exhaustive", "sequential:10" or "similar".
-        left_out: largest share of an image that was left out, because it stands still.
-        seconds: time that each stage took in this run, about 0 if an earlier run had finished it.
+        left_out: largest fraction of an image that was ignored as a static overlay, such as a logo.
+        seconds: time of each stage in this run, about 0 if an earlier run finished the stage.
         files: files and folders that were written.
     """
 

@@ -26,7 +26,7 @@ SPLAT_POINTS = 200_000
 JPEG_QUALITY = 95
 
 CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
-"""Points cover squares in a depth map, with the first side of `CELLS_PX` whose successor covers
+"""Points cover squares in a depth map. Their side is the first in `CELLS_PX` whose successor covers
 less than `CLOSED_GAIN` times the area: few gaps are left then. Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
@@ -51,7 +51,7 @@ def write_transforms(
     points: Path,
     **more: Any,
 ) -> None:
-    """Write nerfstudio's transforms.json, with the point cloud `points`, and `more` at its top.
+    """Write nerfstudio's transforms.json, with the point cloud `points` and `more` top-level keys.
 
     `files` maps a JSON key, such as "file_path", to the file of each image, by image name.
     """
@@ -84,8 +84,8 @@ def write_transforms(
 def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
     """Write splat/: undistorted images/, sparse/0, depths/ (16-bit PNG), and transforms.json.
 
-    The first program for Gaussian splatting takes the middle of an image for its principal point.
-    Therefore images are cropped, and a warning says so, unless it is there already.
+    The original program for Gaussian splatting assumes that the principal point is in the middle of
+    the image. Images where it is elsewhere are therefore cropped, and a warning says so.
 
     The model in sparse/0 has the sparse points with their tracks, and at most `SPLAT_POINTS` of the
     dense points, chosen evenly in space.
@@ -97,8 +97,8 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
     if across or down:
         warnings.warn(
             f"the images in {target.name}/ are cropped by up to {across} pixels in width and "
-            f"{down} in height, so that their principal points are in the middle, where the first "
-            "program for Gaussian splatting takes them to be",
+            f"{down} in height, so that their principal points are in the middle, as the original "
+            "program for Gaussian splatting assumes",
             UserWarning,
             stacklevel=2,
         )
@@ -148,7 +148,7 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
 
 
 def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of at most `count` points (N, 3): the best in each cubic cell of space."""
+    """Return the indices of at most `count` points (N, 3): the most accurate in each cubic cell."""
     order = np.argsort(errors, kind="stable")
     if len(points) <= count:
         return order

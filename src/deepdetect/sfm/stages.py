@@ -67,7 +67,7 @@ from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
-"""The choice "auto" matches all pairs of images if there are at most this number."""
+"""The choice "auto" matches all pairs if there are at most this number of images."""
 
 WORK = "work"
 """Name of the folder of intermediate results, inside the output folder."""
@@ -77,8 +77,8 @@ LINKS = ".images"
 folder is hidden, so that a search for images in a folder above does not find them twice."""
 
 COMPARED_RUNS = 8
-"""An overlay is looked for in this number of runs of three images, spread over all: images that
-follow each other by name are mostly of one camera. Chosen by hand."""
+"""An overlay is searched for in this number of runs of three images, spread over all images: images
+with successive names are mostly from one camera. Chosen by hand."""
 
 
 @suggest_keywords
@@ -183,7 +183,7 @@ class Stages:
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
         """Return a folder that holds all images, and no results.
 
-        For a list of files, or an output folder inside the given one, it holds links to the images.
+        For a list of files, or an output folder among the images, it holds links to the images.
         """
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
@@ -205,14 +205,14 @@ class Stages:
         return folder
 
     def find_overlays(self, paths: Sequence[Path]) -> list[np.ndarray]:
-        """Return where images of each size show an overlay; an earlier run's result stays."""
+        """Return the overlay masks, one per image size; the result of an earlier run is reused."""
         file = self.work / "overlays.npz"
         if not self.features.exists():
             found: dict[str, np.ndarray] = {}
             starts = np.linspace(0, max(0, len(paths) - MIN_VIEWS), COMPARED_RUNS).astype(int)
             for start in sorted({*starts.tolist()}):
                 grays = []
-                with contextlib.suppress(ImageError):  # the extraction names it
+                with contextlib.suppress(ImageError):  # the extraction reports it
                     grays = [luma(load_image(path)) for path in paths[start : start + MIN_VIEWS]]
                 if len(grays) == MIN_VIEWS and (mask := find_overlay(grays, self.seed)).any():
                     size = "{1}x{0}".format(*mask.shape)
@@ -232,7 +232,7 @@ class Stages:
         """Detect and describe the keypoints of all images below a folder.
 
         Returns three mappings by image name: the sizes (width, height) and the numbers of keypoints
-        of the images that could be read, and, for each other image, a sentence that says why not.
+        of the images that could be read, and, for each other image, a sentence on why it could not.
         """
         overlays = self.find_overlays([folder / name for name in check_images(folder)])
         report = extract_features(
@@ -253,7 +253,7 @@ class Stages:
                 if name in described:
                     width, height = file[name]["image_size"][()]
                     wide = width >= MIN_ASPECT * height
-                    looked = wide or not sizes  # for a rim: until one has none
+                    looked = wide or not sizes  # for a fisheye's rim, until one image has none
                     try:
                         require_pinhole(path, load_image(path) if looked else None)
                     except ValueError as error:
@@ -359,7 +359,7 @@ class Stages:
             verified = {(a, b): count for a, b, count in noted["verified"]}
             components = [frozenset(names) for names in noted["components"]]
             return pycolmap.Reconstruction(sparse), verified, components
-        # SQLite would take the log of a killed run's database for that of the new database.
+        # SQLite would mistake the log of a killed run's database for the log of the new database.
         for old in (*self.work.glob("mapping-*.json"), *self.output.glob("database.db-*")):
             old.unlink()
         with atomic_path(database) as path:
@@ -465,6 +465,6 @@ def _depth_task(
 def _fuse_task(
     images: list[RegisteredImage], paths: Mapping[str, Path], stride_px: int
 ) -> np.ndarray:
-    images = [image for image in images if image.view.name in paths]  # some have no map
+    images = [image for image in images if image.view.name in paths]  # some images have no map
     maps = [(load_arrays(paths[image.view.name]) or {})["depth"] for image in images]
     return fuse_depth_maps([limited_view(image.view) for image in images], maps, stride_px)

@@ -34,19 +34,19 @@ interpolation dampens noise by an amount that depends on the sub-pixel position.
 
 MIN_FACING, MAX_GROWTH, MIN_COMMON_POINTS = 0.3, 7.0, 10
 """A patch is searched for in another image only if the cosine of the angle between its normal and
-the direction to that camera exceeds the first value, its area there differs by less than the second
-factor, and the images share at least the last number of points. Chosen by hand."""
+the direction to that camera exceeds `MIN_FACING`, its area there changes by a factor below
+`MAX_GROWTH`, and the images share at least `MIN_COMMON_POINTS` points. Chosen by hand."""
 
 DENSE_CELLS, MIN_DISTANCE_PX = 4500, 3
-"""Each of this number of grid cells of an image begins at most one dense track, farther than this
-from all earlier tracks in the image. Chosen by hand."""
+"""An image is divided into `DENSE_CELLS` cells. Each begins at most one dense track, farther than
+`MIN_DISTANCE_PX` from all earlier tracks in the image. Chosen by hand."""
 
 MIN_DENSE_VIEWS = 3
-"""A dense track needs at least this number of images: with two, no third one checks the match."""
+"""A dense track needs at least this number of images: a third image checks the match of two."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
-"""Images are cached, because successive images share neighbours: at least `CACHED_IMAGES`, and more
-if all have at most `CACHED_PIXELS` pixels together (of seven bytes each)."""
+"""Images are cached, because successive images share neighbours: at least `CACHED_IMAGES` images,
+and more as long as they have at most `CACHED_PIXELS` pixels together (seven bytes each)."""
 
 
 class Surfaces(NamedTuple):
@@ -98,7 +98,7 @@ def add_dense_tracks(
 
 
 def _central_views(sparse: SparseModel) -> dict[str, tuple[Surfaces, np.ndarray]]:
-    """Return, by image, the points that it sees most centrally, and their indices.
+    """Return, by image, the points that the image sees most centrally, and their indices.
 
     The image nearest to the mean line of sight to a point sees it most centrally. The surface at
     the point is assumed to face the mean direction.

@@ -1,4 +1,4 @@
-"""Finding patches of one image in later images, under an affine deformation, by Gauss-Newton.
+"""Find patches of one image in later images, under an affine deformation, by Gauss-Newton.
 
 The method is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004): each
 iteration computes only the residuals anew. Gain and offset of the brightness are eliminated.
@@ -62,7 +62,7 @@ class Patches(NamedTuple):
 
     @classmethod
     def none(cls) -> Patches:
-        """Return no patches."""
+        """Return an empty set of patches."""
         pixels = (2 * RADIUS_PX + 1) ** 2
         values = np.empty((0, pixels), np.float32)
         steps = np.empty((0, 6, pixels), np.float32)

@@ -1,4 +1,4 @@
-"""Tracking from a video, a folder or a camera to a video with the tracks and a CSV file."""
+"""Track points in a video, a folder or a camera; write a video with the tracks and a CSV file."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ MIN_SIDE_PX = 32
 """`max_side`, the longer side of scaled frames, must be at least this. Chosen by hand."""
 
 COMPARED_FRAMES, MAX_STEP = 8, 15
-"""An overlay is looked for in this number of frames, before the tracking or, of a camera, once they
-were seen. They are at most the second number of frames apart, half a second of most videos, so that
-they show the same places."""
+"""An overlay is searched for in COMPARED_FRAMES frames: before the tracking, or, for a camera, once
+these frames have been recorded. The frames are at most MAX_STEP apart, half a second of most
+videos, so that they show the same places."""
 
 RATE_FRAMES = 10
 """The displayed frame rate is a mean over this number of frames."""
@@ -51,9 +51,9 @@ class TrackingReport:
         fps: frames processed per second, including drawing and writing.
         seconds: total time.
         files: files that were written.
-        expected: number of frames that the source states, or None. A truncated file has fewer.
+        expected: number of frames that the source states, or None. A truncated file gives fewer.
         failures: a sentence on each frame of a folder that was left out.
-        left_out: share of the frames that was left out, because it stands still.
+        left_out: share of each frame that was ignored because it stands still, as captions do.
     """
 
     frames: int
@@ -203,7 +203,7 @@ def track(
 
 
 def _compared_frames(source: str | Path | int, every: int) -> list[np.ndarray]:
-    """Return the first frames of a file or folder, in which an overlay is looked for, as luma."""
+    """Return the first frames of a file or folder as luma, to search them for an overlay."""
     with FrameSource(source) as whole:
         step = min(MAX_STEP, max(1, (whole.count or 0) // COMPARED_FRAMES))
     with FrameSource(source, every=step * every, max_frames=COMPARED_FRAMES) as some:
@@ -211,7 +211,7 @@ def _compared_frames(source: str | Path | int, every: int) -> list[np.ndarray]:
 
 
 def _told_overlay(grays: list[np.ndarray]) -> np.ndarray | None:
-    """Return where frames show an overlay, of which a warning tells, or None."""
+    """Return the mask of an overlay in frames, or None; warn if there is an overlay."""
     overlay = find_overlay(grays)
     tell_still(float(overlay.mean()))
     return overlay if overlay.any() else None
@@ -230,7 +230,7 @@ def output_files(output: str | Path) -> tuple[Path | None, Path]:
 def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
     """Yield a function that tells whether a signal has asked to end the recording of a camera.
 
-    The first signal is only noted, so that the files are finished. A second one ends the process.
+    The first signal is only noted, so that the files are finished. The second ends the process.
     """
     noted: list[int] = []
     with ExitStack() as handlers:

@@ -1,4 +1,4 @@
-"""Tracking of points from frame to frame by pyramidal Lucas-Kanade.
+"""Track points from frame to frame by pyramidal Lucas-Kanade.
 
 Lucas and Kanade, "An iterative image registration technique", 1981, with Bouguet's pyramid. Each
 point is followed to the next frame and back, and dropped if it does not come back to where it was
@@ -33,8 +33,8 @@ CANDIDATES = 3
 """The detector finds this many keypoints per track, so that enough are far from existing tracks."""
 
 MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
-"""A new point keeps the larger of two distances from all tracks: the first number in pixels, or the
-second times the spacing of a grid of `max_keypoints`, so that points cover the whole image."""
+"""A new point is farther from all tracks than MIN_DISTANCE_PX and than MIN_SPACING times the
+spacing of a regular grid of `max_keypoints` points, so that points cover the whole image."""
 
 WINDOW_PX, LEVELS = 21, 3
 """Side of the patch that is followed, and number of pyramid levels above the image. Each level
@@ -133,7 +133,7 @@ class Tracker:
             if self._gray.shape != gray.shape:
                 (height, width), (before_height, before_width) = gray.shape, self._gray.shape
                 raise OptionError(
-                    f"a frame has {width}x{height} pixels, but earlier ones have "
+                    f"a frame has {width}x{height} pixels, but earlier frames have "
                     f"{before_width}x{before_height}: use one tracker for each size"
                 )
             self._follow(self._gray, gray, hidden)

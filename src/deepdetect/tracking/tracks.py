@@ -155,6 +155,6 @@ class TrackDrawer:
 
 
 def track_color(track: int) -> tuple[int, int, int]:
-    """Return the RGB colour of a track number; it is bright."""
+    """Return a bright RGB colour for a track number."""
     red, green, blue = colorsys.hsv_to_rgb(track * HUE_STEP % 1, 0.8, 1.0)
     return round(255 * red), round(255 * green), round(255 * blue)

@@ -1,4 +1,4 @@
-"""Frames of a video file, a folder of images, or a camera; and video files of frames."""
+"""Read frames of a video file, a folder of images, or a camera; write frames to a video file."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ MAX_FPS = 1000.0
 """If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
 FIRST_FRAMES = 25
-"""This many frames are compared: if all are equal, so are some of their packets, since counters in
-the headers of H.264 start again after 16 frames, and MPEG's groups of pictures after 12 to 15."""
+"""This number of frames are compared. If all are really equal, so are some of their packets, since
+counters in H.264 headers restart after 16 frames, and MPEG's groups of pictures after 12 to 15."""
 
 SINGLE = "has a single frame: give a video, or a folder of frames"
 
@@ -59,7 +59,7 @@ class Frame:
 class FrameSource(AbstractContextManager["FrameSource"]):
     """The frames of a video file, of the images below a folder or in a file, or of a camera.
 
-    Iterate over it once, in a `with` block.
+    Iterate over the source once, in a `with` block.
 
     Args:
         source: a video, an image file of several pages or frames, such as TIFF or GIF, a folder
@@ -181,9 +181,9 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 def _check_decoded(path: Path) -> None:
     """Warn if the first frames of a video are all equal; raise an error if they should not be.
 
-    The conversion of interlaced frames fails in OpenCV 4.14 and 5.0, which then return what was in
-    the memory before. If the frames of a video are equal, so are some of its packets, or packets
-    only say that nothing changes.
+    The conversion of interlaced frames fails in OpenCV 4.14 and 5.0, which then return the previous
+    contents of the memory. If the frames of a video are really equal, some of its packets are
+    equal, or packets only state that nothing changes.
     """
 
     def first(video: Any) -> list[tuple[int, int]]:
@@ -199,8 +199,8 @@ def _check_decoded(path: Path) -> None:
     differ = packets and len({*packets}) == len(packets)
     if differ and np.median([size for _, size in packets]) > unchanged:
         raise InvalidFileError(
-            f"{text}, but should not be, as where the installed OpenCV fails with interlaced "
-            f'videos: convert it, such as by ffmpeg -i "{path}" -vf yadif progressive.mp4'
+            f"{text}, but should not be: the installed OpenCV may fail with interlaced videos; "
+            f'convert the video, such as by ffmpeg -i "{path}" -vf yadif progressive.mp4'
         )
     warnings.warn(f"{text}: check that nothing moves in them", UserWarning, stacklevel=2)
 
@@ -216,7 +216,7 @@ def _camera_number(source: str | Path | int) -> int | None:
 
 
 def _undecoded(path: Path) -> Any:
-    """Open a video for its packets, which FFmpeg reads in a fiftieth of the time of frames."""
+    """Open a video to read its packets, which FFmpeg reads in a fiftieth of the time of frames."""
     if cv2.CAP_FFMPEG not in cv2.videoio_registry.getBackends():
         return cv2.VideoCapture(str(path))
     return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])

@@ -1,8 +1,8 @@
-"""The compiled parts of stereo matching. Importing them needs numba; first calls compile them.
+"""Compiled kernels of stereo matching. Importing this module loads numba; first calls compile.
 
 Kernels named `..._rows` process the rows `first` to `last - 1` of their arrays. The innermost axis
-of an array is the disparity, or the column, so that vector instructions process many values at
-once. Sums of costs have 16 bits.
+of an array is the disparity or the column, so that vector instructions process many values at once.
+Sums of costs have 16 bits.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def census_rows(first, last, padded, out):  # type: ignore[no-untyped-def]
     for y in range(first, last):
         out[y] = 0
         here = padded[y + radius_y, radius_x:]
-        for start in range(0, bits, 8):  # vectors hold more bytes than words
+        for start in range(0, bits, 8):  # bytes: a vector register holds more of them than words
             end = min(start + 8, bits)
             part[:] = 0
             for bit in range(start, end):
@@ -226,8 +226,8 @@ def smooth_rows(first, last, disparity, radius, max_difference, out):  # type: i
     """Write for each pixel the mean disparity of the surface that it lies on, within a window.
 
     `disparity` is padded by `radius`. Two pixels on opposite sides of the centre count only if the
-    disparities of both differ from the centre's by at most `max_difference`. So a slanted plane
-    keeps its disparity, also next to an edge.
+    disparities of both differ from the centre's by at most `max_difference`. Slanted planes
+    therefore keep their disparity, also next to an edge.
     """
     width = out.shape[1]
     total, weight = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)

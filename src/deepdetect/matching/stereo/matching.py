@@ -27,32 +27,32 @@ from .sgm import (
 )
 
 MAX_SPECKLE_AREA_PX, SPECKLE_SUBDIVISIONS = 100, 4
-"""Isolated patches of one surface with at most this many pixels are dropped, with disparities in
-this many steps per pixel, because OpenCV's speckle filter needs integers. Chosen by hand."""
+"""Isolated patches of at most MAX_SPECKLE_AREA_PX pixels are dropped. Disparities are first rounded
+to SPECKLE_SUBDIVISIONS steps per pixel: OpenCV's speckle filter needs integers. Chosen by hand."""
 
 BORDER_PX = 4
 """Matches this near to the left or the right border of the right image are dropped, because windows
 give content just outside the image the disparity of content just inside. Chosen by hand."""
 
 OCCLUDING_EDGE_PX, OCCLUSION_SLACK_PX = 1, 8
-"""Width in pixels of the edge of nearer surfaces that is dropped if occlusions are filled. A gap
-between two surfaces may be an occlusion if it is at most the second number of pixels wider than
-their difference of disparity, because windows reach over both ends of the gap."""
+"""OCCLUDING_EDGE_PX is the width of the edge that nearer surfaces lose if occlusions are filled. A
+gap between two surfaces may be an occlusion if its width exceeds their disparity difference by at
+most OCCLUSION_SLACK_PX, because windows reach over both ends of the gap."""
 
 MIN_SUPPORT_PX = 5
 """Lines that extrapolate a surface are fitted to at least this many pixels. Chosen by hand."""
 
 SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX, SEARCH_UNIQUENESS_RATIO = 160, 50, 1.3
-"""If no range is given, it is searched on a copy of this width, without patches up to this area.
-Any other match on the row must cost at least the third value times as much as the best, which false
-matches rarely reach. So the range just covers the Motorcycle pair and Middlebury's scenes."""
+"""If no range is given, copies of this width are matched. Patches up to SEARCH_MAX_SPECKLE_AREA_PX
+are dropped, and matches whose runner-up costs less than SEARCH_UNIQUENESS_RATIO times as much:
+most are false. The range then just covers the Motorcycle pair and Middlebury's scenes."""
 
 TAIL_FRACTION = 0.01
 """This fraction of disparities at each end of the range counts as unreliable. Chosen by hand."""
 
 SEARCH_MARGIN_PX, SEARCH_MARGIN_FRACTION = 1.5, 0.2
-"""The range is extended at both ends by the first value, in pixels of the small copy, plus the
-second value times its length, because some objects are too small to be seen in the copy."""
+"""The range is extended at both ends by SEARCH_MARGIN_PX, in pixels of the small copy, plus
+SEARCH_MARGIN_FRACTION times its length, because some objects are too small for the copy."""
 
 
 @suggest_keywords
@@ -251,8 +251,8 @@ def compute_disparity(
 def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange | None:
     """Find the disparity range of a rectified pair, of both signs and up to half its width.
 
-    A small copy of the pair is matched over all of these disparities. The range is that of the
-    patches where both views agree; None if they agree nowhere.
+    A small copy of the pair is matched over all of these disparities. The range spans the patches
+    where both views agree; None if the views agree nowhere.
     """
     height, width = left.shape
     scale = max(width / SEARCH_WIDTH_PX, 1.0)
@@ -282,8 +282,8 @@ def range_with_margin(
 def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) -> np.ndarray:
     """Return the mask of the known pixels without small patches, which are mostly wrong.
 
-    Patches of at most `max_area_px` pixels are removed. Neighbours are in one patch if their
-    disparities differ by at most twice `MAX_DIFFERENCE_PX`.
+    Patches of at most `max_area_px` pixels are removed. Neighbouring pixels are in one patch if
+    their disparities differ by at most twice `MAX_DIFFERENCE_PX`.
     """
     invalid = np.iinfo(np.int16).min
     steps = np.where(known, np.rint(disparity * SPECKLE_SUBDIVISIONS), invalid).astype(np.int16)
@@ -321,7 +321,7 @@ def _square(radius_px: int) -> np.ndarray:
 def fill_occlusions(disparity: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fill unknown pixels with the smaller of the nearest known disparities left and right of them.
 
-    The smaller disparity is taken because what the right view does not show lies behind the surface
+    The smaller disparity is used because what the right view does not show lies behind the surface
     that occludes it. Rows where nothing is known get 0. The second array, (H, W) bool, is true in
     gaps between two known pixels that are no wider than the nearer surface can occlude.
     """

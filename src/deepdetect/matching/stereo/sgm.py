@@ -3,7 +3,7 @@
 Hirschmüller, "Stereo processing by semi-global matching and mutual information" (PAMI 2008), with
 census transforms (Zabih and Woodfill, ECCV 1994), which do not depend on brightness and contrast. A
 parabola through the costs of three disparities gives sub-pixel disparities that are biased towards
-integers. So they are only the start of a fit of the grey values along the row (Lucas and Kanade,
+integers. They only initialise a fit of the grey values along the row (Lucas and Kanade,
 1981). `benchmarks/row_matching.py` measures the errors of both steps.
 """
 
@@ -33,39 +33,39 @@ LANES = 16
 """The number of disparities is rounded up to a multiple of this, for vector registers."""
 
 VOLUME_BYTES, BAND_OVERLAP_PX = 400_000_000, 32
-"""Cost volumes of more bytes than this are computed in bands of rows, each with this many further
-rows above and below it, from which paths enter the band. Chosen by hand."""
+"""Cost volumes of more than VOLUME_BYTES are computed in bands of rows. Each band has
+BAND_OVERLAP_PX further rows above and below, from which paths enter the band. Chosen by hand."""
 
 SAMPLED_ROW_STEP = 48
-"""The typical Hamming distance of matches is measured on one row in this many. Chosen by hand."""
+"""The typical Hamming distance of matches is measured on every SAMPLED_ROW_STEP-th row."""
 
 P1_BITS, P2_BITS, MIN_P2_BITS, P2_HALF_GRADIENT_LEVELS = 20, 100, 25, 8
-"""Penalties, in census bits per pixel, for a disparity that changes by one pixel along a path, and
-for a larger change: `P2_BITS` where the grey level is constant, half of it where neighbours differ
-by `P2_HALF_GRADIENT_LEVELS`, and at least `MIN_P2_BITS`. They are the best of a few values that
-were tried on the Motorcycle pair; noisy images of full size would need larger ones."""
+"""Penalties, in census bits per pixel. `P1_BITS` is for a disparity that changes by one pixel along
+a path. For larger changes, the penalty is `P2_BITS` where the grey level is constant, half of it
+where neighbours differ by `P2_HALF_GRADIENT_LEVELS`, and at least `MIN_P2_BITS`. The best of a few
+values on the Motorcycle pair were chosen; noisy images of full size would need larger ones."""
 
 OUTSIDE_COST = 0.6
-"""Cost of a match outside the right image, if the pair's median match costs 0 and a wrong match 1.
-It lets surfaces continue there; a lower cost loses more of the border in noisy views."""
+"""Cost of a match outside the right image, where 0 is the pair's median match and 1 a wrong match.
+This lets surfaces continue outside; a lower cost loses more of the border in noisy views."""
 
 MAX_DIFFERENCE_PX = 1.0
 """Disparities of neighbours on one surface differ by at most this. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
-"""Radius in pixels of the windows in which the grey values are fitted. It and the next values were
-chosen on the Motorcycle pair."""
+"""Radius in pixels of the windows in which the grey values are fitted. This and the constants below
+were chosen on the Motorcycle pair."""
 
 SMOOTHING_RADII_PX, FINAL_SMOOTHING_RADIUS_PX = (4, 4), 2
-"""Radii of the windows in which the disparities of one surface are averaged before each iteration
-of the fit, to reduce the bias of the parabola, and after the last."""
+"""Radii of windows in which the disparities of one surface are averaged: before each iteration of
+the fit, to reduce the bias of the parabola, and after the last iteration."""
 
 NOISE_LEVELS = 2.0
 """Gradients below this, in grey levels per pixel, are noise: the averaged disparity is kept."""
 
 MIN_GAIN = 0.2
 """Minimum of the factor by which the fit multiplies the right view's grey values to match the left
-view. If it is lower, the right view shows something else, and the disparity is not refined."""
+view. If the factor is lower, the right view shows something else, and no disparity is refined."""
 
 UNKNOWN = np.float32(1e9)
 """This value stands for an unknown disparity: it is too large to share a surface with any other."""
@@ -165,7 +165,7 @@ def is_textured(gray: np.ndarray) -> np.ndarray:
 def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
     """Return the median Hamming distance of a pair's matches in bits, measured on some rows.
 
-    Matches here are pixels that have the least cost for each other, without sums along paths.
+    Here, two pixels match if each has the least cost for the other, without sums along paths.
     """
     height = len(censuses[0])
     centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)

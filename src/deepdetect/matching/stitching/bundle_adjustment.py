@@ -1,7 +1,8 @@
 """Bundle adjustment of a panorama: homographies, or rotations and focal lengths of cameras.
 
-It uses Gauss-Newton with Huber weights. A residual is the distance between a match in the second
-image and its partner, mapped from the first image to the common frame and on to the second image.
+The fit uses Gauss-Newton with Huber weights. A residual is the distance between a match in the
+second image and its partner, mapped from the first image to the common frame and on to the second
+image.
 """
 
 from __future__ import annotations
@@ -16,8 +17,7 @@ from ...geometry.camera import Camera, Size
 from ...geometry.transforms import transform_points
 
 MAX_ITERATIONS, MIN_STEP = 20, 1e-7
-"""The fit ends after the first number of iterations, or earlier if no parameter changes by more
-than the second value."""
+"""The fit ends after MAX_ITERATIONS, or earlier if no parameter changes by more than MIN_STEP."""
 
 UNIT_PX = 500.0
 """Unit of length in the fit, chosen so that all entries of a homography have similar magnitudes."""
@@ -165,7 +165,7 @@ def _in_units(
     }
     links = []
     for pair in pairs:
-        # The targets come from the homography: it is more accurate than integer keypoints.
+        # The targets come from the homography, which is more accurate than integer keypoints.
         targets = transform_points(pair.points, pair.homography)
         points = transform_points(pair.points, to_unit[pair.first])
         targets = transform_points(targets, to_unit[pair.second])
@@ -178,9 +178,9 @@ def _normal_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return both sides of the normal equations.
 
-    A step changes each homography H to H (I + E). `directions` gives the (9, P) derivatives of E by
-    the P parameters of each image, `columns` the index of the first parameter of each image that is
-    not fixed.
+    A step changes each homography H to H (I + E). `directions` gives the (9, P) derivatives of E
+    with respect to the P parameters of each image, and `columns` the index of the first parameter
+    of each image that is not fixed.
     """
     count = sum(matrix.shape[1] for matrix in directions.values())
     normal, right = np.zeros((count, count)), np.zeros(count)
@@ -208,7 +208,7 @@ def _linearised(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (M, 2) residuals in the second image, and their (M, 2, 9) derivatives for each image.
 
-    The derivatives are by E, where a step changes a homography H to H (I + E).
+    The derivatives are with respect to E: a step changes a homography H to H (I + E).
     """
     between = np.linalg.inv(second) @ first
     homogeneous = np.column_stack([points, np.ones(len(points))])
@@ -245,7 +245,7 @@ def _rotations(homographies: Matrices, focal: float) -> tuple[dict[int, np.ndarr
 
 
 def _turns_and_focal(focal: float) -> np.ndarray:
-    """Return (9, 4) derivatives of E in H (I + E) by three rotations and the log focal length."""
+    """Return E's (9, 4) derivatives, in H (I + E), by three rotations and the log focal length."""
     turns = np.zeros((4, 3, 3))
     turns[0, 1, 2], turns[0, 2, 1] = -focal, 1 / focal
     turns[1, 0, 2], turns[1, 2, 0] = focal, -1 / focal

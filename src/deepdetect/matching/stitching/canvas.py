@@ -30,8 +30,8 @@ MAX_DEPTH_RATIO = 5.0
 images near the horizon are stretched without bound. Chosen by hand; not measured."""
 
 MIN_WARP_SCALE, MIN_SHOWN_PX = 0.67, 16
-"""Images drawn at a scale below MIN_WARP_SCALE would alias and are blurred first, at most as if the
-longer side were drawn with MIN_SHOWN_PX, because wider blurs take minutes."""
+"""Images drawn at a scale below MIN_WARP_SCALE would alias, so they are blurred first, but not more
+than for a longer side of MIN_SHOWN_PX, because wider blurs take minutes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +75,8 @@ class Canvas:
         if width * height > max_megapixels * 1e6:
             raise OptionError(
                 f"the panorama would be {width}x{height} pixels, {width * height / 1e6:.0f} "
-                f"megapixels and more than max_canvas_megapixels ({max_megapixels:g}): raise it, "
-                "or make `scale` smaller"
+                f"megapixels and more than max_canvas_megapixels ({max_megapixels:g}): raise this "
+                "limit, or make `scale` smaller"
             )
         require_memory(
             f"a panorama of {width}x{height} pixels would",
@@ -103,7 +103,7 @@ def plan_plane(
 ) -> tuple[Canvas, dict[int, np.ndarray]]:
     """Find the smallest flat canvas that holds all images, and their homographies to it.
 
-    It has `scale` pixels per pixel of the reference. `homographies` map to any common frame.
+    The canvas has `scale` pixels per pixel of the reference. `homographies` map to a common frame.
     """
     back = np.linalg.inv(homographies[reference])
     placed = {number: back @ matrix for number, matrix in homographies.items()}
@@ -154,7 +154,7 @@ def plan_curved(
     """Find the smallest canvas of all images on a cylinder or a sphere.
 
     It has `scale` pixels per pixel at the centre of the reference, and a full turn is rounded to
-    whole pixels. If images show 360 degrees, its borders cut the one opposite the reference.
+    whole pixels. If images show 360 degrees, its borders cut the image opposite the reference.
     """
     turn = round(2 * np.pi * cameras[reference].focal_px * scale)
     angles = {n: float(np.arctan2(*one.rotation[[0, 2], 2])) for n, one in cameras.items()}
@@ -233,8 +233,8 @@ def _smooth(rgb: np.ndarray, shown: float) -> np.ndarray:
 def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
     """Return the depths of an image's corners, (4,), as seen by the camera of the common frame.
 
-    For equal cameras that only rotate, they are proportional to the cosines of the angles from its
-    optical axis. Beyond the horizon, they are negative.
+    For equal cameras that only rotate, the depths are proportional to the cosines of the angles
+    from the optical axis of that camera. Depths beyond the horizon are negative.
     """
     # A determinant of 1, as for a rotation, fixes the arbitrary factor and the sign of the depths.
     matrix = homography / np.cbrt(np.linalg.det(homography))

@@ -25,8 +25,8 @@ MIN_OVERLAP_PX = 100
 pixels of the small canvas. Chosen by hand."""
 
 SEAM_TOLERANCE_PX, SEAM_PERCENT = 1.0, 90.0
-"""Parallax is reported if the displacements along a seam exceed the first value, in pixels of the
-small canvas, at the percentile given by the second. Smaller displacements are invisible."""
+"""Parallax is reported if the percentile SEAM_PERCENT of the displacements along a seam exceeds
+SEAM_TOLERANCE_PX, in pixels of the small canvas. Smaller displacements are invisible."""
 
 MIN_FLOW_PX = 32
 """Optical flow needs an overlap with at least this width and height. Chosen by hand."""
@@ -51,7 +51,7 @@ def composite(
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
     low = {place: canvas.draw(place, *small[image_of(place)], scale) for place in canvas.boxes}
-    low = {place: one for place, one in low.items() if one.mask.size}  # some are empty
+    low = {place: one for place, one in low.items() if one.mask.size}  # omits empty images
     gains = _gains(low)
     seams = _seams(low, gains)
     parallax = {pair: px / scale for pair, px in _parallax(low, gains, seams).items()}
@@ -125,8 +125,8 @@ class _Blender:
 def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
     """Find gains near 1 that make images equally bright where they overlap.
 
-    They solve a least-squares problem as in Brown and Lowe, "Automatic panoramic image stitching
-    using invariant features", 2007, but in logarithms.
+    The gains solve a least-squares problem as in Brown and Lowe, "Automatic panoramic image
+    stitching using invariant features", 2007, but in logarithms.
     """
     numbers = [*dict.fromkeys(map(image_of, low))]
     rows, right = [*np.eye(len(numbers)) / GAIN_PRIOR_STD], [0.0] * len(numbers)

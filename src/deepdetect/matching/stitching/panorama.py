@@ -65,7 +65,7 @@ class Panorama:
 
     Attributes:
         image: (H, W, 3) RGB, black outside of all images; uint16 if an image has more than 8 bits,
-            otherwise uint8. If all images are uint16, its numbers are theirs.
+            otherwise uint8. If all images are uint16, it keeps their values.
         valid: (H, W) bool, true where an image is.
         homographies: (3, 3) homographies by image number, in the order in which images were
             connected. For a flat panorama they map to `image`, otherwise to the reference image.

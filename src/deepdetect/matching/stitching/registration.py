@@ -1,4 +1,4 @@
-"""Estimate homographies from many images to the frame of one.
+"""Estimate homographies from many images to the frame of one of them.
 
 Sparse keypoints show which images overlap. These pairs are registered by guided matching, and dense
 keypoints must confirm them. The pairs with most matches form a spanning tree. Homographies composed
@@ -58,16 +58,16 @@ MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MIN_STILL = 0.9
-"""Two images from one place show the same nearly everywhere. With less than this fraction explained
-by no motion, what stands still is a menu or a caption."""
+"""If a homography that moves nothing explains less than this fraction of two images, only a menu or
+a caption stands still. Images taken with a still camera agree nearly everywhere."""
 
 MIN_EXPLAINED = 0.3
 """A homography must explain at least this fraction of what both images show in common. Wrong ones
-of towers that are alike reach 0.12, screens of which half stands still 0.59."""
+explain up to 0.12 (similar towers). Screens of which half stands still have 0.59."""
 
 MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
 """Images contradict each other if the RMS residual of their joint fit exceeds the inlier threshold
-of a homography: a typical match is then an outlier. It is 0.2 to 1 px if nothing is wrong."""
+of a homography: a typical match is then an outlier. Correct fits have residuals of 0.2 to 1 px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +110,8 @@ def register_images(
     Sparse points find overlaps and dense keypoints confirm homographies; the points of a detector
     without heat map do both. The largest group of connected images is registered, or the group that
     contains image number `reference`. If `turning`, cameras that only rotate are estimated as well.
-    If `force`, images that contradict each other give a warning, not an error. `names` are those
-    of the images in both.
+    If `force`, images that contradict each other give a warning, not an error. `names` are names
+    of the images for messages.
     """
     done = progress or (lambda _: None)
     names = names or [f"images[{number}]" for number in range(len(images))]
@@ -225,7 +225,7 @@ def _registered_pairs(
         enough = partners[[first, second]].min() >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
-        # Most matches on repeated structure may be wrong, so the others are tried as well.
+        # On repeated structure, most matches may be wrong, so all homographies are tried.
         tried = (_register(views, first, second, each.matrix) for each in found)
         registered = next((each for each in tried if each is not None), None)
         if registered is not None:
@@ -265,7 +265,7 @@ def _registered_again(
 
     On repeated or collinear structure (windows, towers), keypoints can give a wrong homography. The
     new result replaces the old one if it has more matches. A panorama of 360 degrees needs the pair
-    that closes it, or its ends drift apart.
+    that closes the loop, or its ends drift apart.
     """
     known = {(pair.first, pair.second): pair for pair in pairs}
     partners: dict[int, set[int]] = {number: set() for number in to_common}
