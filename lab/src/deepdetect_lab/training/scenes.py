@@ -57,9 +57,9 @@ effects happen, the last one counts. `FAR_ZOOM` enlarges or reduces, with equal 
 used because a descriptor that was trained on less zoom was worse on zoomed images."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
-"""The first number of each pair is for the rotation of the first view, the second for the rotation
-between the views. `ROTATED_SHARES` are the shares of rotations by any angle. All other angles have
-the standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees)."""
+"""Index 0 is for the rotation of the first view, index 1 for the rotation between the views.
+`ROTATED_SHARES` are the shares of rotations by any angle. All other angles are small, with the
+standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees)."""
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
 """The tilt of a view is the ratio of its scales along two axes. In the share `NORMAL_TILT` of the
@@ -68,8 +68,8 @@ all other second views, the logarithm is uniform up to the tilt `LARGEST_TILT`, 
 seen at 66 degrees. Beyond it, little of the plane can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
-"""`FIRST_TILT` is for the scene, `FRONT_TILT` for the parts in front. The tilt in first views
-exceeds 1, which means no tilt, by at most these values."""
+"""The tilt of the scene in first views is at most 1 + `FIRST_TILT`, and the tilt of parts in front
+at most 1 + `FRONT_TILT`. A tilt of 1 means no tilt."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
 """Standard deviation of both perspective coefficients of a homography, per pixel of a view with

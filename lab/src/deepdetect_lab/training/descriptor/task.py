@@ -166,7 +166,7 @@ class DescriptorTrainer(Trainer):
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
 
-        `pairs` are those that no earlier step has used, or None; `numbers` are their numbers.
+        `pairs` holds the pairs that no earlier step has used, or None; `numbers` identifies them.
         """
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(
@@ -180,7 +180,7 @@ class DescriptorTrainer(Trainer):
     def loss(self, batch: tuple[int, list[int], Pair | None]) -> Tensor:
         """Return the loss of the pairs that a step trains on.
 
-        `batch` holds the number of the step and its new pairs. They replace the oldest pairs in
+        `batch` holds the number of the step and its new pairs. These replace the oldest pairs in
         `window`, a buffer on the device, which already holds the other pairs of the step.
         """
         step, numbers, pairs = batch

@@ -56,7 +56,7 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
 
 
 def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
-    """Return the probability (N,) to choose a candidate: 0 if a close one has a larger logit."""
+    """Return each candidate's probability (N,) of selection, 0 near one with a larger logit."""
     logits = ranker(torch.from_numpy(view.features))
     radii = least_distances(view.sigma_px)  # the same as in detection
     kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))

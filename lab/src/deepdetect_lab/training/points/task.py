@@ -148,7 +148,7 @@ class RankerTrainer(Trainer):
         )
 
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
-        """Return the mean loss of pairs, 0 for those with fewer than two candidates in a view."""
+        """Return the mean loss of pairs. Pairs with under two candidates in a view have loss 0."""
         losses = [
             pair_loss(self.network, pair)
             for pair in batch
