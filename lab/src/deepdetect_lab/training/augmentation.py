@@ -48,7 +48,7 @@ CROP_SCALE = (0.7, 1.0)
 
 INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
 """Names of OpenCV's interpolations, `cv2.INTER_...`. If a view is not rotated by an arbitrary
-angle, one of them is drawn at random to downscale it."""
+angle, one of these interpolations is drawn at random to downscale the view."""
 
 LIGHT = Light(
     share=0.5,

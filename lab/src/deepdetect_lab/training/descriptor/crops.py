@@ -32,7 +32,7 @@ FAR_SCALE = Effect(0.4, math.log(0.4), math.log(2.4))
 the network learns the same descriptors at any scale."""
 
 ATTEMPTS = 50
-"""Photographs to try per crop, since some have no reading yet if training starts early."""
+"""Number of photographs to try per crop, since some may have no reading (teacher outputs) yet."""
 
 
 class Crops(NamedTuple):
@@ -63,7 +63,7 @@ def draw_crop(rng: np.random.Generator, reading: Reading) -> Crops | None:
     size = np.array(reading.luma.shape[::-1])
     reach = np.maximum(0, size - scale * CROP_PX) / 2
     place = (size - 1) / 2 + rng.uniform(-reach, reach)
-    # The view shows the photograph rotated by `angle`, so this map to it rotates by -`angle`.
+    # The view shows the photograph rotated by `angle`, so the map back rotates by -`angle`.
     to_photograph = view_homography(CROP_PX, place, scale * rotation(-angle), np.zeros(2))
     xy = transform_points(reading.xy, np.linalg.inv(to_photograph))
     rows = np.flatnonzero(((xy > MARGIN_PX) & (xy < CROP_PX - 1 - MARGIN_PX)).all(1))

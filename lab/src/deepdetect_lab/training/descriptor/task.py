@@ -59,7 +59,7 @@ def pairs_to_draw(
 
 
 def draw_numbered(files: Sequence[Path], *seed: int) -> Pair:
-    """Draw the pair of a seed; raise an OptionError if the images have too little detail."""
+    """Draw the pair that a seed determines; raise an OptionError for images of little detail."""
     generator = np.random.default_rng(seed)
     return draw_until_seen(lambda: draw_pair(generator, files))
 
@@ -135,7 +135,7 @@ class DescriptorTrainer(Trainer):
         self.average = copy.deepcopy(self.network).eval()
         self.network.train()
         # Muon suits layers between many features. AdamW trains the other parameters: the first
-        # layer, the layers that take the keypoint's size or give few numbers, and vectors.
+        # layer, the layers that take the keypoint's size or have few outputs, and vectors.
         groups: dict[tuple[bool, float], list[Any]] = {}
         for name, parameter in self.network.named_parameters():
             kernel = parameter.ndim > 1 and not name.startswith(self.no_kernels)
