@@ -72,8 +72,8 @@ TEXT = (
     f"neighbours with ratio {RATIO:g}, or without ratio test if descriptors are learned.",
     f'"{STRAIGHT_AHEAD}" uses no image. It assumes no rotation, and the second camera in front of '
     "the first. For images from a moving car this guess is often nearly correct.",
-    "Guided matching decides by thresholds whether a scene is a plane or has depth. These were "
-    "chosen on Strecha's fountain and a KITTI clip, so these two scenes do not test them.",
+    "Guided matching decides by thresholds whether a scene is a plane or has depth. The thresholds "
+    "were chosen on Strecha's fountain and a KITTI clip, so these two scenes do not test them.",
 )
 
 NOTE = (
