@@ -21,7 +21,7 @@ DEVELOPMENT = {
         ),
         "acceptance": (
             "deepdetect_lab.cli.evaluate",
-            "Let an engine of guided matching answer pairs of all kinds.",
+            "Judge a matching engine on image pairs of many kinds.",
         ),
         "sensitivity": (
             "deepdetect_lab.cli.evaluate",
@@ -41,7 +41,7 @@ DEVELOPMENT = {
         "shards": ("deepdetect_lab.cli.train", "Pack images for training on large sets."),
         "read-teachers": (
             "deepdetect_lab.cli.train",
-            "Read published descriptors at points of photographs, to learn from them.",
+            "Compute published descriptors at points of photographs, to learn from them.",
         ),
         "train-points": ("deepdetect_lab.cli.train", "Train the ranker of keypoints on images."),
         "train-match-filter": (

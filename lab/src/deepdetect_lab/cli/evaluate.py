@@ -1,4 +1,4 @@
-"""Commands that evaluate: weights, stereo, clouds, detectors, and engines of guided matching."""
+"""Commands that evaluate weights, stereo matches, clouds, detectors, and matching engines."""
 
 from __future__ import annotations
 
@@ -186,17 +186,17 @@ def acceptance(
     output: cli.Output = Path("acceptance"),
     **values: Any,
 ) -> cli.Result:
-    """Let an engine of guided matching answer pairs of all kinds, and count right answers.
+    """Run a matching engine on image pairs of many kinds, and count its right answers.
 
     Writes answers.jsonl, with a line for each answer, and acceptance.csv, with a line for each
-    kind of pair. A second run only does what is missing.
+    kind of pair. A second run only computes missing answers.
 
         deepdetect dev acceptance data -o today
         deepdetect dev acceptance data --family facades --every 5 --seeds 1 -o quick
         deepdetect dev acceptance data --engine my_engine:match -o mine
 
     Args:
-        family: Which pairs; may be repeated. [default: all]
+        family: A family of pairs to match; may be repeated. [default: all]
         engine: A function MODULE:FUNCTION of two images and a seed that returns matches.
             [default: match_images]
         output: Folder for both files.
@@ -224,14 +224,14 @@ def sensitivity(
 ) -> cli.Result:
     """Multiply each constant of guided matching by 0.7 and 1.4, and count answers that change.
 
-    Writes a file of answers for each change, and sensitivity.csv. A second run only does what is
-    missing.
+    Writes a file of answers for each change, and sensitivity.csv. A second run only computes
+    missing answers.
 
         deepdetect dev sensitivity data --family oxford --family posed -o sensitivity
 
     Args:
-        family: Which pairs; may be repeated. [default: all]
-        every: Answer only every Nth pair of a family.
+        family: A family of pairs to match; may be repeated. [default: all]
+        every: Match only every Nth pair of a family.
         output: Folder for the files.
     """
     folder = cli.output_folder(output)

@@ -118,7 +118,7 @@ def chosen_recipe(
     labels = chosen_label_settings(detectors, label_settings)
     if label_settings is not None:
         values["labels"] = labels
-    elif detectors is not None:  # keeps the preset's settings of these
+    elif detectors is not None:  # keeps the preset's settings of these detectors
         values["labels"] = recipe.labels.with_detectors(labels.detectors)
     return replace(recipe, **values)
 
@@ -216,18 +216,18 @@ def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) ->
 def read_teachers(
     *images: cli.Images, output: cli.Output, edgepoint: Path, aliked: Path
 ) -> cli.Result:
-    """Read two published descriptor networks at points of photographs, to train our own on them.
+    """Compute two published descriptors at points of photographs, to train our own on them.
 
-    `train-descriptor --crops 6 --readings FOLDER` learns from the files that this writes, one for
-    each photograph. To resume, run the command again.
+    Writes one file per photograph, from which `train-descriptor --crops 6 --readings FOLDER`
+    learns. To resume, run the command again.
 
         deepdetect dev read-teachers photos/train photos/val -o readings --edgepoint e64.onnx
             --aliked aliked-n16rot.pth
 
     Args:
         output: Folder for the readings.
-        edgepoint: EdgePoint2-E64 as an ONNX file (MIT): image to scores and descriptors.
-        aliked: The authors' file of the weights of ALIKED-n16rot (BSD-3-Clause).
+        edgepoint: ONNX file of EdgePoint2-E64 (MIT), from image to scores and descriptors.
+        aliked: The authors' weights file of ALIKED-n16rot (BSD-3-Clause).
     """
     from ..training.teachers.readings import Teachers, write_readings
 
@@ -269,7 +269,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """
     folder = cli.output_folder(output)
     how = SHARDS_RUN.take(values)
-    # Shards do not depend on the stages, so this one stands for any: its crops fit every size.
+    # Shards do not depend on the stages, so this stage stands for any: its crops fit every view.
     recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
     made = write_shards(images, folder, recipe, quiet=False, **how)
     return cli.Result(

@@ -159,7 +159,7 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
     part = _part(path)
     for k, url in enumerate(file.urls):
         if k and file.checksum is None:
-            part.unlink(missing_ok=True)  # bytes of another host may differ
+            part.unlink(missing_ok=True)  # the bytes so far may not fit this host's file
         try:
             _fetch(url, file, part, quiet)
             if file.checksum is not None and not has_checksum(part, file.checksum):

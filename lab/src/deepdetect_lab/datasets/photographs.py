@@ -37,10 +37,10 @@ JPEG_QUALITY = 97
 VALIDATION_SHARE = 1 / 20
 
 FREE_LICENCES = ("CC0", "CC BY", "CC BY-SA", "Unsplash")
-"""Licences whose names begin with these allow any use, also of weights trained on the images."""
+"""Licences with these name prefixes allow any use, including of weights trained on the images."""
 
 RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECASE)
-"""Licences with these words in their names restrict use, however the names begin."""
+"""Licences with these words in their names restrict use, even if they match `FREE_LICENCES`."""
 
 LICENCES_FILE = "licences.csv"
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
@@ -84,8 +84,8 @@ def listed_sources() -> dict[str, Source]:
 class Crop:
     """A square crop of a photograph from a `Source`.
 
-    `path`, `sha256` and `licence` are those of the photograph. It is scaled so that its shorter
-    side is `short_side_px`. In the scaled photograph, (x, y) is the upper left corner of the crop.
+    `path`, `sha256` and `licence` are those of the photograph. Its shorter side is scaled to
+    `short_side_px`. In the scaled photograph, (x, y) is the upper left corner of the crop.
     """
 
     source: str

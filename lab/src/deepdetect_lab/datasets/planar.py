@@ -41,7 +41,7 @@ NOT_IN_D2NET_SUBSET = {
 class PlanarPair:
     """Two images that a homography relates: they show a plane, or come from one viewpoint.
 
-    The first is image 1 of its scene, the second image `number`. `homography` (3, 3) maps column
+    `first` is image 1 of the scene, `second` is image `number`. `homography` (3, 3) maps column
     vectors (x, y, 1) of the first image to the second. The centre of the first pixel is (0, 0).
     `kind` says what changes between the images, such as "viewpoint", or is "" if unknown.
     """
@@ -72,7 +72,7 @@ class PlanarScene:
         return [self.pairs[0].first, *(pair.second for pair in self.pairs)]
 
     def with_max_pairs(self, max_pairs: int) -> PlanarScene:
-        """Return the scene with at most `max_pairs` evenly spaced pairs, for 1 the last pair."""
+        """Return the scene with at most `max_pairs` evenly spaced pairs; 1 keeps the last pair."""
         kept = self.pairs[-1:] if max_pairs == 1 else evenly_spaced(self.pairs, max_pairs)
         return replace(self, pairs=tuple(kept))
 

@@ -223,8 +223,8 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
         axes, centre = pose[:, :3], pose[:, 3]
         image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
         _image_size(path)  # raises an error if the image is damaged or has an EXIF rotation
-        # The poses are those of KITTI's first camera, but another one may have taken the images.
-        # The last column of the projection matrix gives the offset between the two.
+        # The poses are those of KITTI's first camera, but another camera may have taken the images.
+        # The last column of the projection matrix gives the offset between these cameras.
         offset = np.linalg.solve(image.intrinsics, projection[:, 3])
         images.append(replace(image, translation=image.translation + offset))
     return images
@@ -271,7 +271,7 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
 
 
 def _is_pinhole(camera: Any) -> bool:
-    """Whether a `pycolmap.Camera` sees the border of its image as a pinhole camera does."""
+    """Whether a `pycolmap.Camera` has no lens distortion, tested at the border of its image."""
     if not camera.focal_length_idxs():  # a panorama
         return False
     size = np.array([camera.width, camera.height])
@@ -318,9 +318,9 @@ def _posed_image(
 def _scaled(
     intrinsics: np.ndarray, size: tuple[float, float], image: Path, file: Path
 ) -> np.ndarray:
-    """Scale intrinsics from a size (width, height) to that of an image file.
+    """Scale intrinsics given for an image of `size` (width, height) to the size of an image file.
 
-    The borders of the two sizes are aligned, not the centres of their first pixels.
+    The outer borders of the two images are aligned, not the centres of their first pixels.
     """
     own = _image_size(image)
     if min(size) <= 0 or abs(own[0] * size[1] / (own[1] * size[0]) - 1) > MAX_ASPECT_ERROR:

@@ -44,8 +44,8 @@ def run_benchmarks(
 ) -> Report:
     """Run the named benchmarks of `BENCHMARKS` and return one report.
 
-    `data` has a subfolder for each data set, or is the folder of the only data set. If a data set
-    is missing, its benchmark fails. If only one benchmark is named, an ImageError is raised.
+    `data` has a subfolder for each data set, or is the folder of the only data set. A benchmark
+    without its data set is reported as failed, but if only one is named, an ImageError is raised.
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]

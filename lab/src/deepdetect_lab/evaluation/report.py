@@ -31,7 +31,7 @@ def where(rows: Iterable[Row], **wanted: Any) -> Rows:
 
 
 def mean(rows: Iterable[Row], name: Any) -> float | None:
-    """Return the mean of the rows' values `name` that are neither None nor NaN; None if none is."""
+    """Return the mean of the rows' values `name` without None and NaN; None if no value is left."""
     return mean_of(row[name] for row in rows)
 
 

@@ -236,7 +236,7 @@ class Run:
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
     ) -> tuple[list[np.ndarray], float]:
-        """Return the descriptors of two images and their seconds; keep them for the next call."""
+        """Return descriptors of two images and the seconds taken; keep them for the next call."""
         name = key(*feature.key, images, [len(keypoints) for keypoints in both])
         if self._described is None or self._described[0] != name:
             self._described = None  # frees the old descriptors before new ones are computed

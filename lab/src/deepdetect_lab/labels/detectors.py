@@ -2,7 +2,7 @@
 
 To add a detector, write a function that takes an (H, W) uint8 grey image and settings and returns
 an (H, W) bool mask. Add it to `DETECTORS`. For each setting, give the value for normal images (the
-paper's, if it has one) and the allowed range.
+paper's value, if there is one) and the allowed range.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ GRAY_LEVELS = (0, 255)
 BLOCK_SIZES = (1, 255)
 KERNEL_SIZES = range(1, 32, 2)
 CANNY_THRESHOLDS = (0, 2040)
-"""Allowed range of Canny's thresholds: that of |dx| + |dy| of 3x3 Sobel filters on 8-bit images."""
+"""Allowed range of Canny's thresholds: the values of |dx| + |dy| (3x3 Sobel) of 8-bit images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +41,11 @@ class LabelDetector:
     """A classical detector.
 
     Attributes:
-        kind: whether it marks keypoints or edges (the two masks of the paper's Figure 4).
+        kind: whether the detector marks keypoints or edges (two masks in the paper's Figure 4).
         function: function that takes an (H, W) uint8 grey image and all settings, and returns an
             (H, W) bool mask.
-        settings: for each setting, its value for normal images and its allowed range, None if it is
-            not numeric.
+        settings: for each setting, its value for normal images and its allowed range. The range is
+            None for a bool.
         low_visibility: the settings whose values differ for images of low visibility.
     """
 
@@ -67,7 +67,7 @@ class LabelDetector:
 def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:
     """Return a bool mask that marks, for each of the points (N, 2), the nearest pixel.
 
-    `shape` is that of the image. Points outside the image are ignored. Halves are rounded to even.
+    `shape` is the image's shape. Points outside the image are ignored. Halves are rounded to even.
     """
     mask = np.zeros(shape[:2], dtype=bool)
     column, row = np.rint(np.asarray(xy, dtype=np.float64).reshape(-1, 2)).astype(np.intp).T
@@ -119,7 +119,7 @@ def _brisk_detector(threshold: int, octaves: int) -> cv2.Feature2D:
 
 def _brisk(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect AGAST corners in a scale space (Leutenegger et al., 2011)."""
-    # OpenCV fails on layers smaller than a pixel. An octave's smaller layer has 2/3 of its size.
+    # OpenCV fails on layers smaller than a pixel. Each octave has a second layer, scaled by 2/3.
     most = (2 * min(gray.shape) // 3).bit_length()
     return _marked(gray, _brisk_detector(settings["threshold"], min(settings["octaves"], most)))
 

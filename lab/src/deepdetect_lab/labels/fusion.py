@@ -27,7 +27,7 @@ from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
 
 LOW_VISIBILITY_RANGE = 64
-"""An image has low visibility if its luma spans fewer grey levels; `visibility_of` says why."""
+"""An image has low visibility if its luma spans fewer grey levels than this (`visibility_of`)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,7 +63,7 @@ def visibility_of(gray: np.ndarray) -> Visibility:
     """Decide whether an image has normal or low visibility, which selects detector settings.
 
     An image has low visibility if its luma spans fewer than 64 grey levels between the 1st and the
-    99th percentile. (The paper's darkened images span at most 32, its normal ones at least 146.)
+    99th percentile. The paper's darkened images span at most 32, normal images at least 146 levels.
 
     Args:
         gray: (H, W) uint8 luma.
@@ -154,7 +154,7 @@ def label_file(task: LabelTask) -> dict[str, Any] | str:
     try:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)
-    except MissingExtraError:  # affects all images
+    except MissingExtraError:  # every image would fail in the same way
         raise
     except DeepDetectError as error:
         return str(error)

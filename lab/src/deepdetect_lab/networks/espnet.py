@@ -29,8 +29,8 @@ class DilatedConvolution(nn.Module):
     """A dilated 3x3 convolution, which computes in float32 on the CPU even under autocast.
 
     On the CPU, in bfloat16 and with channels_last, PyTorch 2.13 returns NaN or wrong gradients for
-    dilated convolutions. With our own code for the gradients, in place of float32, a training step
-    was only 7 % faster.
+    dilated convolutions. Writing our own gradients instead of using float32 made a training step
+    only 7 % faster.
     """
 
     def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
@@ -65,7 +65,7 @@ class SpatialPyramid(nn.Module):
             setattr(self, f"d{dilation}", DilatedConvolution(narrow, width, dilation))
 
     def branches(self, x: Tensor) -> Tensor:
-        """Return the concatenated branches, partly summed.
+        """Return the outputs of the branches, partly summed, as one concatenated tensor.
 
         From dilation 4 on, a branch is replaced by the sum of the branches from dilation 2 up to
         itself.

@@ -33,7 +33,7 @@ OPSET = 17
 """Version of the ONNX operator set. ONNX Runtime 1.24, OpenVINO and OpenCV 4 can all read it."""
 
 _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
-"""Shape of batch normalisation's factors that multiply a kernel, by type of convolution."""
+"""Shape to which batch normalisation's factors are brought to multiply a kernel, by node type."""
 
 
 def to_onnx(
@@ -45,7 +45,7 @@ def to_onnx(
 ) -> onnx.ModelProto:
     """Convert a network to ONNX by tracing it with example `inputs`, which are given by name.
 
-    `output` is the name of the output, or of several with blanks between them.
+    `output` names the output, or several outputs separated by blanks.
     `axes` maps each input or output to the names of its axes of variable size, by axis number.
     """
     written = io.BytesIO()
@@ -84,7 +84,7 @@ def export_onnx(network: nn.Module, path: str | Path) -> None:
 
 
 def add_padding(model: ModelProto) -> None:
-    """Extend a network that maps `image` to `logits`: accept any size, also output probabilities.
+    """Let a network that maps `image` to `logits` take any image size and also give probabilities.
 
     As in `compute_maps`, the last row and column of the image are repeated until its sides are
     multiples of 8, and the maps are cropped to the size of the image. Probabilities are clipped to
@@ -116,7 +116,7 @@ def add_padding(model: ModelProto) -> None:
 def fold_normalisation(graph: GraphProto) -> None:
     """Fold each batch normalisation into the convolution before it.
 
-    Without a convolution before it, a normalisation becomes a factor and an offset. Folding uses
+    A normalisation without a convolution before it becomes a product and a sum. Folding uses
     float64, because PyTorch's exporter rounds differently on different processors. The convolutions
     must not have a bias yet.
     """
@@ -157,10 +157,10 @@ def fold_normalisation(graph: GraphProto) -> None:
 
 
 def give_four_dimensions(graph: GraphProto) -> None:
-    """Store numbers per channel as (1, C, 1, 1) instead of the equivalent (C, 1, 1).
+    """Store constants with one value per channel as (1, C, 1, 1) instead of (C, 1, 1).
 
     With three dimensions, OpenVINO transposes the features before and after each sum, product or
-    PReLU with such a constant. These transpositions took a third of the time.
+    PReLU with such a constant. These transpositions took a third of the run time.
     """
     used = {
         name

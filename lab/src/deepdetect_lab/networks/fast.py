@@ -4,7 +4,7 @@ Detectors with small windows compute the labels from the luma, so a few plain co
 Runtimes compute these faster than the dilated branches and sums of ESPNet. But some thresholds of
 the detectors depend on the strongest response in the image, and the settings on its range of grey
 levels. So a global term is computed from the histogram of the luma and from means and maxima of the
-features. It scales the luma at the start, and gives thresholds for the features before upsampling.
+features. The term scales the input luma, and gives thresholds for the features before upsampling.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ RED, GREEN, BLUE = 9798, 19235, 3735
 """Weights of red, green and blue in the luma (BT.601), in units of 1/32,768, as in OpenCV."""
 
 BINS = 24
-"""Number of bins of the luma's histogram. Each value is divided between the two nearest bins.
+"""Number of bins of the luma's histogram. Each pixel is divided between the two nearest bins.
 Chosen by hand; not measured."""
 
 HISTOGRAM_STEP_PX = 8
 """The histogram is made of every 8th pixel in both directions, to save time."""
 
 GAIN_RANGE = (-1, 5)
-"""Range of the natural logarithm of the gain that multiplies the luma. It is this large because
-dark images may span only 1/100 of the grey levels."""
+"""Range of the natural logarithm of the gain that multiplies the luma. The gain may be this large
+because dark images may span only 1/100 of the grey levels."""
 
 
 class Luma(nn.Module):
@@ -42,7 +42,7 @@ class Luma(nn.Module):
 
     Labels are computed from the same luma, and in dark images a single grey level matters. All
     intermediate values are integers below 2^24, which float32 holds exactly. The weighted sum is
-    not written as a convolution, because GPUs would round that (TF32).
+    not written as a convolution, because GPUs may compute convolutions in TF32, which rounds.
     """
 
     def forward(self, image: Tensor) -> Tensor:
@@ -128,7 +128,7 @@ class FastNetwork(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""
-        # Autocast would round the luma, but the detectors' least threshold is one grey level.
+        # Autocast would round the luma, but label detectors have thresholds of one grey level.
         with torch.autocast(image.device.type, enabled=False):
             luma = self.luma(image)
             exposure, mean = self.exposure(luma)

@@ -27,7 +27,7 @@ H and W are multiples of `STRIDE`. To add a network, write a module in this pack
 
 
 FOLDER = Path(__file__).parents[1] / "weights"
-"""Folder of trained weights to start training from; `deepdetect` has the same in ONNX files."""
+"""Folder of trained weights to start from; `deepdetect` has the same weights as ONNX files."""
 
 
 def find_weights(weights: str | Path) -> Path:
@@ -75,7 +75,7 @@ def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
 def average_weights(paths: Sequence[str | Path]) -> nn.Module:
     """Load a network, as `load_network` does, with the mean of the weights in several files.
 
-    The mean of the weights of several training runs is often better than those of each run
+    The mean of the weights of several training runs is often better than the weights of any run
     (Wortsman et al., "Model soups", 2022). Integers, the counters of batch normalisation, are taken
     from the first file.
     """

@@ -36,8 +36,8 @@ BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
 darkened image spans fewer than 64 of the 256 grey levels: low visibility (`visibility_of`)."""
 
 EXPOSURE = (0.05, 0.24)
-"""Range of the brightness of a short exposure, which keeps its contrast. At 0.24, an image of all
-grey levels is just of low visibility."""
+"""Range of the brightness factor of a short exposure; its contrast is kept. At the factor 0.24, an
+image that spans all grey levels barely counts as one of low visibility."""
 
 TURN_PROBABILITY = 0.5
 """Share of the augmented views that are rotated by an arbitrary angle. All other views are rotated
@@ -48,7 +48,7 @@ CROP_SCALE = (0.7, 1.0)
 
 INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
 """Names of OpenCV's interpolations, `cv2.INTER_...`. If a view is not rotated by an arbitrary
-angle, one of them is drawn at random to downscale it."""
+angle, one of these interpolations is drawn at random to downscale the view."""
 
 LIGHT = Light(
     share=0.5,
@@ -60,8 +60,8 @@ CAMERA = Camera(blur=Effect(0.3, 0.5, 2.5), noise=(Effect(0.25, 1, 8),), jpeg=Ef
 """Ranges of the changes of light and camera in augmented views. Chosen by hand; not measured."""
 
 READ_NOISE, SHOT_NOISE = (math.log(0.5), math.log(14.0)), (0.0, 1.0)
-"""Ranges of the noise of a sensor, in grey levels: the logarithm of its deviation in black, and the
-growth of its variance for each level. A phone at night has about 8 and 0.5."""
+"""Ranges of a sensor's noise: log of the read noise's standard deviation in grey levels, and the
+variance that shot noise adds per grey level. A phone at night has about 8 (not its log) and 0.5."""
 
 MAX_JITTER_SATURATION = 1.2
 """A hue rotation also scales the saturation by a random factor up to this one. Chosen by hand."""
@@ -109,7 +109,7 @@ def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -
 
 
 def add_sensor_noise(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Add read and shot noise of a random sensor to (H, W, 3) uint8, grey in half of the cases."""
+    """Add a random sensor's read and shot noise to (H, W, 3) uint8; in half of the cases, grey."""
     read, gain = math.exp(generator.uniform(*READ_NOISE)), generator.uniform(*SHOT_NOISE)
     channels = int(generator.choice([1, 3]))
     noise = generator.standard_normal((*rgb.shape[:2], channels), np.float32)

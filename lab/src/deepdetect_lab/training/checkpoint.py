@@ -65,7 +65,7 @@ def restore(
 ) -> None:
     """Restore a network, its moving average and its optimisers from a checkpoint of the same run.
 
-    The caller makes sure that it is the same run. Shapes of moments are not checked here, and a
+    The caller makes sure that the run is the same. Shapes of moments are not checked here, and a
     fused optimiser would write past the end of a moment that is too small.
     """
     for kind, module in (("network", network), ("average", average)):
@@ -85,7 +85,7 @@ def restore(
 
 
 def _like(value: Tensor, parameter: Tensor) -> Tensor:
-    """Copy a moment to its parameter's device and memory layout, which fused Adam requires."""
+    """Copy an optimiser moment to its parameter's device and memory layout, for fused Adam."""
     if value.shape == parameter.shape:
         return torch.empty_like(parameter).copy_(value)
     return value.to(parameter.device, copy=True)

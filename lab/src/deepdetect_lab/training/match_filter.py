@@ -341,7 +341,7 @@ MEASURES = ("right", "precision", "of unrelated views")
 def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]:
     """Return the loss on validation pairs, and measures of the ratio test and of the filter.
 
-    The filter has two thresholds: logit 0, and one where it is as precise as the ratio test.
+    The filter is measured at the logit threshold 0, and where it is as precise as the ratio test.
     """
     found, losses = {}, []
     for offset, name in enumerate((LEARNED, ROOT_SIFT)):

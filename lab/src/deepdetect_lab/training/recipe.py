@@ -100,7 +100,7 @@ class TrainingOptions:
             validated and saved, and with 0 it equals the weights.
         max_gradient_norm: gradients with a larger norm are scaled down to it; None: no limit.
         frozen_batch_norm: normalise by the statistics stored with the initial weights, because
-            small batches have unreliable ones. None: only if the initial weights are trained.
+            those of small batches are unreliable. None: only if the initial weights are trained.
         pos_weight: weight in the loss of pixels that are marked in the label. With 1, an uncertain
             network marks too few pixels, because most are not marked. Above 1, it marks more.
         low_light_pos_weight: `pos_weight` in crops of low visibility. None: as in all other crops.
@@ -276,7 +276,7 @@ class DescriptorTrainingOptions:
         learning_rate: highest learning rate (of Muon), after the warm-up; it falls linearly to 0.
         val_count: number of validations.
         val_pairs: number of validation pairs of each kind: upright, rotated, zoomed.
-        crops: crops of photographs in each step whose points teachers have read; 0: no teachers.
+        crops: number of crops in each step, from photographs with `readings`; 0: no teachers.
         seed: seed of the weights and the pairs.
 
     Raises:

@@ -113,7 +113,7 @@ def train_on_pairs(
         options: the recipe.
         init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file,
             or with `crops` also EdgePoint2's L64.pth. None: random weights by the seed.
-        readings: folder of the readings of teachers, for a descriptor with `crops` only.
+        readings: folder written by `deepdetect dev read-teachers`, for a descriptor with `crops`.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
         num_workers: number of processes that generate pairs; with 0, the training process does it.
             None: 0, or for a descriptor on a GPU, one less than the number of processors. A match
@@ -143,7 +143,7 @@ def train_on_pairs(
         from .descriptor.taught_task import TaughtTrainer
 
         if readings is None:
-            raise OptionError("`crops` need `readings`, the folder of what teachers read")
+            raise OptionError("`crops` need `readings`, the folder that `read-teachers` wrote")
         trainer = TaughtTrainer(*files, options, init_weights, where, Path(readings))
     elif isinstance(options, DescriptorTrainingOptions):
         from .descriptor.task import DescriptorTrainer

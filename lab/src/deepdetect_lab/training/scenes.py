@@ -1,7 +1,7 @@
 """Synthetic scenes: layers of photographs in two views, with known correspondences.
 
 Both views are warped (zoom, rotation, tilt, perspective), the second one often also by a smooth
-relief. Parts of photographs may lie in front, each with a small motion of its own. So the learned
+relief. Parts of photographs may lie in the foreground, each with a small motion of its own. So the
 descriptor and the match filter learn parallax and occlusion without real pairs of photographs.
 """
 
@@ -57,9 +57,9 @@ effects happen, the last one counts. `FAR_ZOOM` enlarges or reduces, with equal 
 used because a descriptor that was trained on less zoom was worse on zoomed images."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
-"""The first number of each pair is for the rotation of the first view, the second for the rotation
-between the views. `ROTATED_SHARES` are the shares of rotations by any angle. All other angles have
-the standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees)."""
+"""Index 0 is for the rotation of the first view, index 1 for the rotation between the views.
+`ROTATED_SHARES` are the shares of rotations by any angle. All other angles are small, with the
+standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees)."""
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
 """The tilt of a view is the ratio of its scales along two axes. In the share `NORMAL_TILT` of the
@@ -68,8 +68,8 @@ all other second views, the logarithm is uniform up to the tilt `LARGEST_TILT`, 
 seen at 66 degrees. Beyond it, little of the plane can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
-"""`FIRST_TILT` is for the scene, `FRONT_TILT` for the parts in front. The tilt in first views
-exceeds 1, which means no tilt, by at most these values."""
+"""The tilt of the scene in first views is at most 1 + `FIRST_TILT`, and the tilt of foreground
+parts at most 1 + `FRONT_TILT`. A tilt of 1 means no tilt."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
 """Standard deviation of both perspective coefficients of a homography, per pixel of a view with
@@ -84,24 +84,24 @@ RELIEF_SHARE, RELIEF_PX = 0.45, (1.5, 5.0)
 displacements, in pixels, is drawn from the range `RELIEF_PX`."""
 
 SMOOTH_CELLS = (3, 8)
-"""Reliefs and the outlines of parts in front are interpolated from 3 to 7 random values along a
-side. With more values, a relief could not be inverted, and parts in front would be smaller than the
-area that describes a keypoint."""
+"""Reliefs and the outlines of foreground parts are interpolated from 3 to 7 random values along a
+side. With more values, a relief could not be inverted, and foreground parts would be smaller than
+the area that describes a keypoint."""
 
 FRONT_SHARE, FRONT_COUNTS, OTHER_PHOTOGRAPH_SHARE = 0.5, (1, 1, 2, 3), 0.8
-"""`FRONT_SHARE` is the share of the scenes with parts in front. The number of these parts is drawn
-from `FRONT_COUNTS`. The share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs."""
+"""`FRONT_SHARE` is the share of the scenes with foreground parts. Their number is drawn from
+`FRONT_COUNTS`. The share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs."""
 
 SHAPE_PX, UNCOVERED = 480, (0.6, 0.88)
-"""A part in front is cut from a photograph where smooth noise (`SHAPE_PX` pixels a side) is above a
-quantile from `UNCOVERED`. So parts are blobs that hold 12 to 40 % of their photograph."""
+"""A foreground part is cut from a photograph where smooth noise (`SHAPE_PX` pixels a side) exceeds
+a quantile from `UNCOVERED`. So parts are blobs that hold 12 to 40 % of their photograph."""
 
 FRONT_OFFSET_PX, FRONT_SCALE, FRONT_ANGLE = 60.0, 0.2, 0.3
-"""Pose of a part in front relative to the scene's pose, in the first view: largest offset along an
+"""Pose of a foreground part relative to the scene's pose in the first view: largest offset along an
 axis in photograph pixels, and standard deviations of the log scale and of the angle in radians."""
 
 MOTION_SHIFT, MOTION_SCALE, MOTION_ANGLE, MOTION_TILT = 22.0, 0.12, 0.06, 0.15
-"""Standard deviations of the motion of a part in front, relative to the scene, between the views:
+"""Standard deviations of a foreground part's motion relative to the scene, between the views:
 shift in pixels of the first view, log scale, angle in radians, and log tilt."""
 
 ALIASED_SCALE, PIXEL_SIGMA = 1.15, 0.5
@@ -110,7 +110,7 @@ against aliasing. A pixel is treated as a Gaussian with a sigma of `PIXEL_SIGMA`
 widens the Gaussian of a pixel of the photograph to that of a pixel of the view."""
 
 COVERED = 0.5
-"""A part in front counts as visible in a pixel if it covers more than this share of the pixel."""
+"""A foreground part counts as visible in a pixel if it covers more than this share of the pixel."""
 
 STEP_PX = 2.0
 """Derivatives of the map between the views are central differences over this step to either side,
@@ -262,7 +262,7 @@ def _draw_relief(rng: np.random.Generator, side_px: int) -> np.ndarray:
 def _draw_front(
     rng: np.random.Generator, files: Sequence[Path], scene: Layer, poses: tuple[Pose, Pose]
 ) -> Layer:
-    """Draw a part in front of a scene, which moves with the scene and a little on its own."""
+    """Draw a foreground part of a scene, which moves with the scene and a little on its own."""
     first, second = poses
     side_px = scene.views[0].side_px
     other = happens(rng, OTHER_PHOTOGRAPH_SHARE)

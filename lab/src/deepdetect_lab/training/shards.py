@@ -50,7 +50,7 @@ Files = tuple[tuple[Path, int], ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """A folder of shards: path and number of images of each. File names hold a content digest."""
+    """A folder of shards: each shard's path and number of images. Names hold a content digest."""
 
     folder: Path
     training: Files

@@ -28,7 +28,7 @@ bright and dark areas are a quarter to half as wide as the view, like light in a
 
 LIT_RANGE = (0.15, 1.6)
 """Smooth changes of light multiply the values of a view by factors in this range. Darker areas
-would show nothing, and brighter ones would be white."""
+would show nothing, and brighter areas would be white."""
 
 SHADOW_REACH_PX = 80.0
 """The edge of a shadow passes the middle of the view at a distance of up to 80 pixels, so that the

@@ -188,7 +188,7 @@ class Trainer(abc.ABC):
                 log(line)
         measured = {point["step"] for point in state.points}
         if state.step in self.milestones and state.step not in measured:
-            self._validate(state, folder)  # at the start, or if it was interrupted here
+            self._validate(state, folder)  # before step 0, or if this validation was interrupted
         started, pixels = time.monotonic(), 0
         saved = started
         bar = progress(self.steps, "training", "step", log is None, state.step)
@@ -314,8 +314,8 @@ def digests(images: Sequence[Path], validation: Sequence[Path]) -> dict[str, str
 def with_plateau(step: int, steps: int, warm_up: float, decay_share: float) -> float:
     """Return the factor by which the highest learning rate is multiplied in a step.
 
-    It rises linearly to 1 over the first `warm_up` steps, stays there, and falls linearly to 0 over
-    the last share `decay_share` of the steps.
+    The factor rises linearly to 1 over the first `warm_up` steps, stays there, and falls linearly
+    to 0 over the last share `decay_share` of the steps.
     """
     return min(1, (step + 1) / warm_up, (1 - step / steps) / decay_share)
 

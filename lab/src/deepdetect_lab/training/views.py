@@ -110,7 +110,7 @@ def render(image: object, view: View) -> np.ndarray:
 def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray:
     """Make the label, (H, W) bool, of a rendered view, (H, W, 3) uint8 RGB.
 
-    A dark view gets the low-visibility settings, a normal one the normal settings.
+    Label detectors use the low-visibility settings for a dark view, else the normal settings.
     """
     visibility: Visibility = "normal" if view.darkening is None else "low"
     return fuse(luma(rgb), replace(options, visibility=visibility)).mask

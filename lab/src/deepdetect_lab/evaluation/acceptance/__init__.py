@@ -1,1 +1,1 @@
-"""Pairs of many kinds with known answers, and how an engine of guided matching answers them."""
+"""The acceptance set: image pairs of many kinds with known geometry, to judge matching engines."""

@@ -1,4 +1,4 @@
-"""Measure how an engine of guided matching answers pairs whose truth is known."""
+"""Measure how well a matching engine answers image pairs whose true geometry is known."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ FAMILIES: dict[str, Callable[[Path], Iterator[JudgedPair]]] = {
         *(synthetic.frames, synthetic.strips, synthetic.noise),
     )
 }
-"""The families of pairs, by name."""
+"""Functions that yield the pairs of a family (a data set or a kind of rendering), by name."""
 
 ORDERS, F_THRESHOLD_PX, F_CONFIDENCE, F_ITERATIONS, ACCURACY_PX = 11, 1.5, 0.9999, 10_000, 10
-"""MAGSAC gets the matches in this number of random orders, because its answer depends on their
-order. Its threshold, confidence and iterations are those with which others report mAA: the mean,
-over all whole distances up to the last one, of the fraction of the places marked by hand that lie
-within it of both epipolar lines."""
+"""MAGSAC gets the matches in `ORDERS` random orders, because its result depends on their order. Its
+threshold, confidence and iterations are those with which others report mAA (mean average accuracy):
+the fraction of hand-marked correspondences whose points are within d px of their epipolar lines in
+both images, averaged over d = 1, 2, ..., `ACCURACY_PX`."""
 
 COLUMNS = {
     **{"kind": "", "answers": ",d", "right": ",d", "wrong, high": ",d", "wrong, fair": ",d"},
@@ -48,15 +48,15 @@ COLUMNS = {
 
 NOTE = (
     "Right: at least half of the matches are correct, or their pose is; high and fair are the "
-    "confidences of wrong answers; lost: no matches. Matches: median of the answers; precision: "
-    "their mean fraction of correct matches. AUC: area under the curve of the pose errors. mAA: "
-    f"fraction of the hand-marked places near the epipolar lines of MAGSAC, mean over {ORDERS} "
-    "orders of the matches. ±: standard deviation over the seeds of the number of right answers. "
-    "CPU s: median processor time of a pair."
+    "confidences of wrong answers; lost: no matches. Matches: median number of matches of an "
+    "answer; precision: mean fraction of correct matches. AUC: area under the curve of the pose "
+    "errors. mAA: fraction of the hand-marked points near MAGSAC's epipolar lines, mean over "
+    f"{ORDERS} orders of the matches. ±: standard deviation over the seeds of the number of right "
+    "answers. CPU s: median processor time of a pair."
 )
 
 Engine = Callable[..., Matches]
-"""A function of two images, (H, W, 3) uint8 RGB, with the keyword `seed`."""
+"""A matching method to test: a function of two (H, W, 3) uint8 RGB images and keyword `seed`."""
 
 
 def guided() -> Engine:
@@ -75,10 +75,10 @@ def measure(
     every: int = 1,
     quiet: bool = True,
 ) -> Rows:
-    """Answer all pairs with all seeds; return a row for each answer.
+    """Run an engine on all pairs with all seeds; return a row for each answer.
 
     Answers are appended to the file `log`, one JSON object per line. A second call with the same
-    file only does what is missing.
+    file only computes the missing answers.
 
     Args:
         data: folder of the data sets.
@@ -126,7 +126,7 @@ def _pairs(data: Path, family: str, every: int) -> Iterator[JudgedPair]:
 
 
 def answer(pair: JudgedPair, engine: Engine, seed: int) -> Row:
-    """Let an engine answer a pair; return what it said and whether it is right."""
+    """Run an engine on a pair; return a row with its answer and whether the answer is right."""
     images, started = pair.make(), time.process_time()
     matches = engine(*images, seed=seed)
     seconds = time.process_time() - started
@@ -162,7 +162,7 @@ def _accuracy(matches: Matches, places: np.ndarray) -> float:
         matrix = None
         if len(chosen) >= 8:
             limits = F_THRESHOLD_PX, F_CONFIDENCE, F_ITERATIONS
-            with suppress(cv2.error):  # of some orders only
+            with suppress(cv2.error):  # OpenCV fails on some orders only
                 matrix, _ = cv2.findFundamentalMat(
                     points0[chosen], points1[chosen], cv2.USAC_MAGSAC, *limits
                 )
@@ -177,7 +177,7 @@ def _accuracy(matches: Matches, places: np.ndarray) -> float:
 
 
 def _both_lines(matrix: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the larger distance of each place from its two epipolar lines, (K,) pixels."""
+    """Return the larger of each correspondence's two distances from epipolar lines, (K,) pixels."""
     first, second = (np.column_stack([p, np.ones(len(p))]) for p in (places[:, :2], places[:, 2:]))
     lines1, lines0 = first @ matrix.T, second @ matrix
     residuals = np.abs((second * lines1).sum(axis=1))
@@ -186,7 +186,7 @@ def _both_lines(matrix: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def summary(rows: Rows) -> Table:
-    """Return a table with a line for each kind of pair, and one for all."""
+    """Return a table with a line for each kind of pair, and a last line for all pairs."""
     kinds: dict[str, Rows] = {}
     for row in rows:
         kinds.setdefault(row["kind"], []).append(row)

@@ -1,4 +1,4 @@
-"""A pair of images with its true geometry, and whether an answer to it is right."""
+"""Image pairs with their true geometry, which tells whether an answer is right."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ..protocols.pose import ERROR, GOOD_DEG, estimate_pose, pose_errors
 
 RIGHT_PX, MIN_CORRECT = 3.0, 0.5
 """A match is correct if its transfer error on a plane, or else its distance from its epipolar line,
-is below the first value. An answer is right if at least the second fraction of its matches is
-correct, because more wrong ones would outvote them."""
+is below `RIGHT_PX`. An answer is right if at least the fraction `MIN_CORRECT` of its matches is
+correct, because otherwise the wrong matches would outvote the correct ones."""
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0.0]])
 """Fundamental matrix of a rectified pair."""
@@ -28,16 +28,16 @@ Answer = Literal["right", "wrong", "lost"]
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The true geometry of a pair, from which an answer is judged.
+    """The true geometry of a pair, by which an answer is judged.
 
     Attributes:
         homography: (3, 3) homography from the first image to the second, or None.
-        plane: (H, W) bool, where the homography holds; None: everywhere.
-        fundamental: (3, 3) fundamental matrix that holds elsewhere; without it, matches elsewhere
-            are wrong.
+        plane: (H, W) bool, pixels of the first image where the homography holds; None: everywhere.
+        fundamental: (3, 3) fundamental matrix that holds outside the plane. None: matches outside
+            the plane are wrong.
         posed: the cameras. If they are known, an answer with the correct pose is right.
-        by_pose: only the pose decides. The epipolar lines of the truth may be off by pixels.
-        right_px: error limit of a correct match.
+        by_pose: whether only the pose decides. The true epipolar lines may be off by pixels.
+        right_px: error limit of a correct match, in pixels.
         depth: whether the answer must say that the scene has depth.
     """
 
@@ -84,16 +84,16 @@ class Truth:
 
 
 UNRELATED = Truth()
-"""The truth of images that show nothing in common, and of those that do not tell what they show:
-every answer is wrong."""
+"""The truth of pairs that show nothing in common, or of which one image shows nothing: every answer
+with matches is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedPair:
-    """Two images of one kind and their truth. `make` reads or renders the images.
+    """A pair of images and its truth. `kind` names its group; `make` reads or renders the images.
 
-    `correspondences`, (K, 4), are x0, y0, x1, y1 of places marked by hand, from which the accuracy
-    of the fundamental matrix is measured.
+    `correspondences`, (K, 4), are hand-marked points x0, y0, x1, y1, by which the accuracy of the
+    fundamental matrix is measured.
     """
 
     kind: str

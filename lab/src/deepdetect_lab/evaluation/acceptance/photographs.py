@@ -18,14 +18,14 @@ from ...datasets.posed_images import load_posed_scenes
 from .pairs import ROWS, UNRELATED, Images, JudgedPair, Truth
 
 MIDDLEBURY_SIDES_PX, FAR_FRAMES, SAME_PLACE_PX = (None, 480), range(15, 26, 5), 5.0
-"""Stereo pairs are matched at their own size and reduced to the second longer side, because limits
-in pixels decide otherwise there. Frames of a clip at these distances see the street from other
-places. Images of one webcam or tripod fit the identity within a pixel; a match is correct within
-the last distance, because clouds and wind move the rest."""
+"""Stereo pairs are matched at their own size and reduced to a longer side of 480 px, at which
+thresholds in pixels act differently. Frames `FAR_FRAMES` apart see the street from distant places.
+Images of one webcam or tripod fit the identity within a pixel, but matches within `SAME_PLACE_PX`
+count as correct, because clouds and wind move parts of the scene."""
 
 
 def read(first: Path, second: Path, side_px: int | None = None) -> Images:
-    """Read two images, reduced to a longer side if one is given."""
+    """Read two images, reduced to a longer side of `side_px` unless it is None."""
     images = load_image(first), load_image(second)
     if side_px is None:
         return images
@@ -33,7 +33,7 @@ def read(first: Path, second: Path, side_px: int | None = None) -> Images:
 
 
 def oxford(data: Path) -> Iterator[JudgedPair]:
-    """Yield image 1 with each other image of the scenes of Oxford."""
+    """Yield the pairs of image 1 and each other image of the Oxford scenes."""
     for scene in load_oxford(data / "oxford", "refined"):
         for pair in scene.pairs:
             make = partial(read, pair.first, pair.second)
@@ -50,7 +50,7 @@ def middlebury(data: Path) -> Iterator[JudgedPair]:
 
 
 def posed(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs of scenes with known cameras. The pose of an answer decides."""
+    """Yield pairs of scenes with known cameras. An answer with the correct pose is right."""
     for scene in load_posed_scenes(data):
         for pair in scene.pairs:
             far = pair.frame_distance is not None and pair.frame_distance in FAR_FRAMES
@@ -61,23 +61,23 @@ def posed(data: Path) -> Iterator[JudgedPair]:
 
 
 def wide(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs of wide baselines, seasons and light, with places marked by hand."""
+    """Yield pairs with wide baselines or other seasons and light, with points marked by hand."""
     for marked in sorted(data.glob("wide/*/correspondences.txt")):
         first, second = (next(marked.parent.glob(f"{number}.*")) for number in (0, 1))
         places = np.loadtxt(marked).reshape(-1, 4)
         matrix, _ = cv2.findFundamentalMat(places[:, :2], places[:, 2:], cv2.FM_LMEDS)
-        truth = Truth(fundamental=matrix, right_px=10.0)  # the marks are off by pixels
+        truth = Truth(fundamental=matrix, right_px=10.0)  # hand-made marks are off by pixels
         make = partial(read, first, second)
         yield JudgedPair("wide", marked.parent.name, make, truth, places)
 
 
 def webcams(data: Path) -> Iterator[JudgedPair]:
-    """Yield all pairs of photographs of one webcam, in other light, season and weather."""
+    """Yield all pairs of photographs of the same webcam, in different light, season and weather."""
     yield from _from_one_place("webcams", data.glob("webcams/*"), "*.jpg")
 
 
 def exposures(data: Path) -> Iterator[JudgedPair]:
-    """Yield all pairs of exposures of one tripod."""
+    """Yield all pairs of different exposures from the same tripod."""
     yield from _from_one_place("exposures", data.glob("hdr/*"), "*.png")
 
 

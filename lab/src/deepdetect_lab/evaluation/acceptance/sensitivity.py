@@ -26,7 +26,7 @@ MODULES = (
 """The modules whose constants are changed."""
 
 FACTORS = 0.7, 1.4
-"""Each constant is multiplied by both: changes that no reason behind a constant would exclude."""
+"""Each constant is multiplied by each factor. No reason behind a constant excludes such changes."""
 
 COLUMNS = {
     **{"constant": "", "module": "", "value": "", "factor": ".1f", "answers": ",d"},
@@ -34,8 +34,8 @@ COLUMNS = {
 }
 
 NOTE = (
-    "An answer has changed if it is right, wrong or lost where it was not, or has another model or "
-    "confidence. One seed."
+    "An answer has changed if its verdict (right, wrong or lost), model or confidence differs from "
+    "that with the unchanged constant. One seed is used."
 )
 
 Value = float | tuple[float, ...]
@@ -75,7 +75,7 @@ def scaled(value: Value, factor: float) -> Value:
 
 @contextmanager
 def changed(name: str, module: ModuleType, value: Value) -> Iterator[None]:
-    """Give a constant another value, also where modules have imported it."""
+    """Give a constant another value in the context, also in modules that have imported it."""
     before = vars(module)[name]
     users = [
         each
@@ -99,10 +99,10 @@ def sensitivity(
     every: int = 1,
     quiet: bool = True,
 ) -> Rows:
-    """Answer pairs with each constant changed; return a row for each constant and factor.
+    """Match pairs with each constant changed; return a row for each constant and factor.
 
-    Answers are kept in the folder, a file for each change, so that a second call only does what is
-    missing.
+    Answers are kept in the folder, a file for each change, so that a second call only computes the
+    missing answers.
 
     Args:
         data: folder of the data sets.
@@ -148,6 +148,6 @@ def _compared(before: Rows, after: Rows) -> Row:
 
 
 def table(rows: Rows) -> Table:
-    """Return the table of the rows, the constants that change most answers first."""
+    """Return a table of the rows, in which constants that change most answers come first."""
     ordered = sorted(rows, key=lambda row: -row["changed"])
     return Table("sensitivity", "Constants of guided matching", COLUMNS, ordered, NOTE)

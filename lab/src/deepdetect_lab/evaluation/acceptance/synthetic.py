@@ -1,6 +1,6 @@
 """Pairs rendered from photographs: planes, facades, hard views, overlays, frames and strips.
 
-The index of a pair is its seed.
+The random generator of a pair is seeded by numbers of its family and of the pair.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ SIZE, NOISE = (720, 600), 3.0
 levels, about that of a phone indoors."""
 
 SHARES, ASPECTS, MIN_ROTATION_DEG = (0.1, 0.2, 0.4), (6, 8, 12, 16), 5.0
-"""Planes and overlays cover these fractions of the image; strips are this many times as wide as
-high. Frames are laid on pairs whose cameras rotated by at least the last angle, so that the answer
-of images that stand still, no rotation, is clearly wrong."""
+"""Planes and overlays cover `SHARES` of the image. Strips are `ASPECTS` times as wide as high.
+Frames are laid on pairs whose cameras rotated by more than `MIN_ROTATION_DEG`, so that "no
+rotation", which fits the frame because it stands still, is clearly a wrong answer."""
 
 
 class Photographs:
@@ -49,17 +49,17 @@ class Photographs:
         return [pair for scene in load_posed_scenes(self.data) for pair in scene.pairs]
 
     def any(self, rng: np.random.Generator, size: tuple[int, int] = SIZE) -> np.ndarray:
-        """Return a random one of the other photographs, scaled to this size."""
+        """Return a random photograph of `others`, scaled to `size` (width, height)."""
         return resized(load_image(self.others[rng.integers(len(self.others))]), size)
 
     def unlike(self, rng: np.random.Generator) -> list[np.ndarray]:
-        """Return two different ones of the other photographs."""
+        """Return two different photographs of `others`, scaled to `SIZE`."""
         two = rng.choice(len(self.others), 2, replace=False)
         return [resized(load_image(self.others[number]), SIZE) for number in two]
 
 
 def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return a copy of the given size."""
+    """Return a copy of an image, resized to (width, height)."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
@@ -82,7 +82,7 @@ def noisy(image: np.ndarray, rng: np.random.Generator, gain: float = 1.0) -> np.
 
 
 def planes(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs with a plane that is seen from two places, the rest unrelated or with depth."""
+    """Yield pairs of views of a plane in front of unrelated images or of a scene with depth."""
     photographs = Photographs(data)
     for number in range(PLANES):
         share, rectified = SHARES[number % 3], number % 2 == 1
@@ -100,7 +100,7 @@ def _given(images: Images) -> Images:
 def _plane(
     photographs: Photographs, number: int, share: float, rectified: bool
 ) -> tuple[Images, np.ndarray, np.ndarray]:
-    """Render a plane into two views; return them, its homography, and its mask in the first."""
+    """Render a plane into two views; return views, homography, and the mask in the first view."""
     rng = np.random.default_rng([0, number])
     texture = load_image(photographs.planes[rng.integers(len(photographs.planes))])
     if rectified:
@@ -123,10 +123,10 @@ def _plane(
 
 
 def facades(data: Path) -> Iterator[JudgedPair]:
-    """Yield two views of a facade with one repeated window, the second one window to the right.
+    """Yield two views of a facade of equal windows; the second starts one window farther right.
 
-    Nothing seems to have moved. The facade is alone, or surrounded by unrelated content, or has one
-    unique window and surroundings that both images show. Only the last kind can be answered.
+    So nothing seems to have moved. The facade is alone, or surrounded by unrelated content, or has
+    a unique window and surroundings that both images show. Only the last kind can be answered.
     """
     photographs = Photographs(data)
     kinds = "facade alone", "facade between unrelated things", "facade with what occurs once"
@@ -186,7 +186,7 @@ def _facade(
 
 
 def hard_views(data: Path) -> Iterator[JudgedPair]:
-    """Yield photographs with a view from the side, from further away, or in other tones."""
+    """Yield pairs of a photograph and its view from the side, from afar, or in other tones."""
     photographs = Photographs(data)
     for number in range(HARD):
         kind = ("seen from the side", "seen from the side", "zoomed", "other tones")[number % 4]
@@ -222,7 +222,7 @@ def _hard_view(photographs: Photographs, number: int, kind: str) -> tuple[Images
 
 
 def overlays(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs of a moving camera on which the same things stand still."""
+    """Yield pairs of a moving camera with an overlay that stands still in the image."""
     photographs = Photographs(data)
     planar = [pair for scene in load_oxford(data / "oxford", "refined") for pair in scene.pairs]
     for number in range(OVERLAYS):
@@ -244,7 +244,7 @@ def overlays(data: Path) -> Iterator[JudgedPair]:
 
 
 def _overlay(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> np.ndarray:
-    """Return where things stand still: a bonnet, strips of text, or a picture in the picture."""
+    """Return the mask of an overlay: a bonnet, strips of text, or a picture in the picture."""
     height, width = shape
     mask = np.zeros(shape, np.uint8)
     kind = rng.integers(3)
@@ -262,7 +262,7 @@ def _overlay(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> 
 
 
 def frames(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs of a rotating camera in a black frame: letter box, lens, border of a scan."""
+    """Yield pairs of a rotating camera with a black frame: letter box, lens, border of a scan."""
     pairs = [
         pair
         for pair in Photographs(data).posed
@@ -300,7 +300,7 @@ def frames(data: Path) -> Iterator[JudgedPair]:
 
 
 def strips(data: Path) -> Iterator[JudgedPair]:
-    """Yield long strips in unlike light, cut from photographs and from exposures of one place."""
+    """Yield pairs of long strips in different light, cut from photographs and from exposures."""
     photographs = Photographs(data)
     exposed = [pair for folder in photographs.exposures for pair in combinations(folder, 2)]
     for number in range(STRIPS):
@@ -326,7 +326,7 @@ def strips(data: Path) -> Iterator[JudgedPair]:
 
 
 def noise(data: Path) -> Iterator[JudgedPair]:
-    """Yield photographs with pictures of nothing: noise, a gradient, one colour."""
+    """Yield pairs of a photograph and a picture of nothing: one grey level with noise."""
     photographs = Photographs(data)
     for number in range(len(SHARES) * 4):
         rng = np.random.default_rng([6, number])

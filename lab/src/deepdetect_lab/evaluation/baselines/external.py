@@ -118,7 +118,7 @@ def onnx_feature(
 
 
 class _Network(NamedTuple):
-    """A loaded ONNX file. `shapes` has the shape of each input, no int where it is free."""
+    """A loaded ONNX file. `shapes` has the shape of each input, in which free sides are no int."""
 
     shapes: list[list[Any]]
     outputs: list[str]
@@ -158,7 +158,7 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
         side if isinstance(side, int) else max(1, round(own / MAP_SIDE)) * MAP_SIDE if maps else own
         for side, own in zip(sides, (height, width), strict=True)
     ]
-    # Area averaging is only good for downscaling. It would upscale by repeating pixels.
+    # Area averaging is only good for downscaling; when upscaling, it would repeat pixels.
     smaller = wanted[0] <= height and wanted[1] <= width
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     resized = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=method)

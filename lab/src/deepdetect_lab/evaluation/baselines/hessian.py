@@ -62,7 +62,7 @@ HESSIAN: dict[str, LocalFeature] = {
         title,
         detect,
         PAPER_DESCRIPTOR.describe,
-        own_scale=OwnScaleDescriptor(0.5),  # described at size 2.5 sigma; in SIFT 2 sigma
+        own_scale=OwnScaleDescriptor(0.5),  # describes at size 2.5 sigma; SIFT's size is 2 sigma
     )
     for name, title, detect in (
         ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),

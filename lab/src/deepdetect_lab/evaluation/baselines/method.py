@@ -142,7 +142,7 @@ def deepdetect_feature(
     descriptor: PointDescriptor = PAPER_DESCRIPTOR,
     version: str = "",
 ) -> LocalFeature:
-    """Make a local feature from a DeepDetect. Other detectors need `heatmap` and a `version`."""
+    """Make a local feature from a DeepDetect, or any detector with `heatmap` and a `version`."""
     if not version:
         digest = file_digest(detector.weights)[:16]
         version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"

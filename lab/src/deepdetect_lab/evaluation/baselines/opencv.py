@@ -1,6 +1,6 @@
 """OpenCV's classical detectors, with default settings and with the low thresholds of the paper.
 
-SIFT differs from OpenCV's default: it upscales precisely.
+In the standard protocol, SIFT differs from OpenCV's default: it upscales precisely.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def _opencv(name: str) -> LocalFeature:
         return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
 
     title, factory, settings = OPENCV_SETTINGS[name]
-    if name == "sift-precise":  # upscales the image for both in the same way
+    if name == "sift-precise":  # detector and descriptor upscale the image in the same way
         feature = _feature("sift", title, detect, factory, settings)
         return replace(feature, version="2", detection="", own_scale=OwnScaleDescriptor())
     binary = factory in ("ORB_create", "BRISK_create")
@@ -106,7 +106,7 @@ def _opencv(name: str) -> LocalFeature:
 
 
 def self_described(name: str) -> LocalFeature:
-    """Make a local feature that detects and also describes with the `OPENCV_SETTINGS` of a name."""
+    """Make a local feature that detects and describes by the method `OPENCV_SETTINGS[name]`."""
     return replace(
         _opencv(name),
         name=f"{name}-self-described",

@@ -14,7 +14,7 @@ from .method import PAPER_DESCRIPTOR, LocalFeature
 
 
 class RandomDetector:
-    """A detector that gives each pixel a random probability. Each call draws new ones."""
+    """A detector that gives each pixel a random probability, newly drawn in each call."""
 
     def __init__(self, seed: int = 0) -> None:
         self._generator = np.random.default_rng(seed)

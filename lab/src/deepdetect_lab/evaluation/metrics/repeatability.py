@@ -82,7 +82,7 @@ def mutual_nn_repeatability(
 def _in_overlap(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, sizes: Sizes
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of each image that the other one shows, in the second image's frame."""
+    """Return the points of each image that the other image shows, in pixels of the second."""
     mapped = project_visible(points0, homography, sizes[1])
     back = project_visible(points1, np.linalg.inv(homography), sizes[0])
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -95,7 +95,7 @@ def _kd_tree(points: np.ndarray) -> Any:
 
 def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Find the nearest tree point of each point: distance (inf beyond the radius) and index."""
-    # An upper bound saves time. The tree leaves the bound itself out, so it must exceed the radius.
+    # An upper bound saves time. KDTree excludes the bound, so the bound must exceed the radius.
     bound = np.nextafter(radius_px, np.inf)
     workers = -1 if min(tree.n, len(points)) > MIN_POINTS_FOR_THREADS else 1
     distance, rows = tree.query(points, distance_upper_bound=bound, workers=workers)
@@ -121,7 +121,7 @@ def _chance(
 ) -> list[float]:
     """Return the repeatability of `counts` random points in the overlap, for each radius.
 
-    If `on_pixels`, the points are at pixel centres. They are repeated more often than other points
+    If `on_pixels`, the points are at pixel centres. These are repeated more often than other points
     if nothing moves: a circle of 1 px around a pixel centre contains five centres, but has an area
     of 3.14 pixels.
     """

@@ -63,7 +63,7 @@ DENSE_NOTE = (
 
 
 CELL_PX = 4
-"""Clouds are compared in cells of this side in pixels, since some use only every second pixel."""
+"""Side in pixels of the cells in which clouds are compared: some use only every second pixel."""
 
 CLOUD_COLUMNS = {
     "cloud": "",

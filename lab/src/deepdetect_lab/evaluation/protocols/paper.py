@@ -43,7 +43,7 @@ OXFORD_PAIRS = (
     *(("graf", 6), ("wall", 6), ("bikes", 6), ("leuven", 6), ("trees", 6), ("ubc", 6)),
     ("boat", 2),
 )
-"""Image pairs of the paper's Table II: scene and number of the second image. The first is 1."""
+"""Image pairs of the paper's Table II: scene, and number of the image paired with image 1."""
 
 CORRECT_PX = 1.0
 """A match is correct if its transfer error under the true homography is strictly below this."""

@@ -72,8 +72,8 @@ TEXT = (
     f"neighbours with ratio {RATIO:g}, or without ratio test if descriptors are learned.",
     f'"{STRAIGHT_AHEAD}" uses no image. It assumes no rotation, and the second camera in front of '
     "the first. For images from a moving car this guess is often nearly correct.",
-    "Guided matching decides by thresholds whether a scene is a plane or has depth. These were "
-    "chosen on Strecha's fountain and a KITTI clip, so results on these two do not test them.",
+    "Guided matching decides by thresholds whether a scene is a plane or has depth. The thresholds "
+    "were chosen on Strecha's fountain and a KITTI clip, so these two scenes do not test them.",
 )
 
 NOTE = (
@@ -213,9 +213,9 @@ def estimate_pose(
     """
     if len(points0) < MIN_MATCHES:
         return None
-    # The intrinsics may differ, so positions are mapped to one camera. Its focal length is the mean
-    # of both, because with 1 OpenCV 5's MAGSAC is less accurate (median rotation error of SIFT on a
-    # KITTI clip: 0.13 instead of 0.05 degrees).
+    # The intrinsics may differ, so positions are mapped to one camera with the mean focal length.
+    # With a focal length of 1, OpenCV 5's MAGSAC is less accurate (median rotation error of SIFT on
+    # a KITTI clip: 0.13 instead of 0.05 degrees).
     focal = float(np.mean([k[i, i] for k in (intrinsics0, intrinsics1) for i in (0, 1)]))
     camera = np.diag([focal, focal, 1.0])
     first = _of_camera(points0, intrinsics0, camera)

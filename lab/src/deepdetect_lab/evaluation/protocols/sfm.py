@@ -206,9 +206,9 @@ def _version(points: PointDetector) -> str:
 def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
     """Reconstruct a scene by a method, or read the result from the cache.
 
-    Returns the values of `run_method` and the "scene". For true and
-    estimated intrinsics, the keys "true" and "estimated" hold a dict of the `MODEL_COLUMNS` and of
-    the "views", the registered cameras by file name.
+    Returns the values of `run_method` and the "scene". The keys "true" and "estimated" (for true
+    and estimated intrinsics) hold a dict of the `MODEL_COLUMNS` and of "views", the registered
+    cameras by file name.
     """
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}

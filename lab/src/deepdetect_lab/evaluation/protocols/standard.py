@@ -1,4 +1,4 @@
-"""Measure metrics on pairs with homographies, at equal numbers of keypoints, and compare chance."""
+"""Compare features and chance on pairs with homographies, at equal numbers of keypoints."""
 
 from __future__ import annotations
 

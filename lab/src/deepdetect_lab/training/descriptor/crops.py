@@ -1,4 +1,4 @@
-"""Crops of photographs that teachers have read, changed as a camera would change them."""
+"""Crops of photographs that have a `Reading` of the teachers, with simulated camera effects."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from ..teachers.readings import Reading, load_reading, reading_file
 from .views import JITTER_PX, SIZE_ERRORS, photograph_view
 
 CROP_PX, CROP_POINTS = 384, 384
-"""Crops are three quarters as wide as the photographs, so that they show about as much around a
-point as the teachers saw. Each step draws 384 of the points that were read there, because the loss
-compares all with all."""
+"""Side of a crop in pixels, and number of points per crop. Crops are three quarters as wide as the
+photographs, so that they show about as much around a point as the teachers saw. The number of
+points is limited because the loss compares all pairs of points."""
 
 TURNED_SHARE, CLEAN_SHARE = 0.15, 0.4
-"""Shares of the crops that are turned by any angle, and that show the photograph as it is. With
-more turned or changed ones, the codes of upright photographs were learned less well."""
+"""Share of the crops that are rotated by any angle, and share that get no camera effects. With more
+rotated or degraded crops, descriptors of upright photographs were learned less well."""
 
 FAR_SCALE = Effect(0.4, math.log(0.4), math.log(2.4))
-"""Share of the crops whose scale is not drawn from `SCALE` but from this wider range of its
-logarithm, so that the network learns the same codes at any scale."""
+"""The log scale of 40 % of the crops is drawn from this range, which is wider than `SCALE`, so that
+the network learns the same descriptors at any scale."""
 
 ATTEMPTS = 50
-"""Photographs are drawn this often until one has been read: training may start before all are."""
+"""Number of photographs to try per crop, since some may have no reading (teacher outputs) yet."""
 
 
 class Crops(NamedTuple):
-    """A batch of crops, or one without the first axis.
+    """A batch of crops, or a single crop without the first axis.
 
     Attributes:
-        images: (B, S, S) uint8 changed views, while the teachers read the unchanged photograph.
+        images: (B, S, S) uint8 degraded views; the teachers saw the photograph itself.
         positions: (B, N, 2) float32, in pixels.
         sizes: (B, N) float32 diameters, in pixels.
-        codes: (B, N, 192) float16 codes of the teachers; in losses, float32 and whitened.
-        survival: (B, N) float32, the share of the points of the photograph that ALIKED finds worse.
-        turn: (B,) float32, the angle by which the photograph is turned, in radians.
+        codes: (B, N, 192) float16 descriptors of the teachers; in losses, float32 and whitened.
+        survival: (B, N) float32, share of the photograph's points with a lower score of ALIKED.
+        turn: (B,) float32, the angle by which the photograph is rotated, in radians.
     """
 
     images: Any
@@ -56,14 +56,14 @@ class Crops(NamedTuple):
 
 
 def draw_crop(rng: np.random.Generator, reading: Reading) -> Crops | None:
-    """Draw a turned and zoomed crop of a photograph; return None if nothing was read there."""
+    """Draw a rotated and zoomed crop; return None if it holds no point of the reading."""
     scale = math.exp((FAR_SCALE if FAR_SCALE.happens(rng) else SCALE).strength(rng))
     turned = happens(rng, TURNED_SHARE)
     angle = rng.uniform(-math.pi, math.pi) if turned else rng.normal(0, UPRIGHT_DEVIATIONS[0])
     size = np.array(reading.luma.shape[::-1])
     reach = np.maximum(0, size - scale * CROP_PX) / 2
     place = (size - 1) / 2 + rng.uniform(-reach, reach)
-    # The view shows the photograph turned by `angle`: its own axes are turned back there.
+    # The view shows the photograph rotated by `angle`, so the map back rotates by -`angle`.
     to_photograph = view_homography(CROP_PX, place, scale * rotation(-angle), np.zeros(2))
     xy = transform_points(reading.xy, np.linalg.inv(to_photograph))
     rows = np.flatnonzero(((xy > MARGIN_PX) & (xy < CROP_PX - 1 - MARGIN_PX)).all(1))
@@ -84,10 +84,10 @@ def draw_crop(rng: np.random.Generator, reading: Reading) -> Crops | None:
 def draw_crops(
     files: Sequence[Path], readings: Path, count: int, rng: np.random.Generator
 ) -> Crops:
-    """Draw crops of photographs that have been read, and stack them.
+    """Draw crops of photographs that have a reading, and stack them.
 
     Raises:
-        OptionError: hardly any photograph has been read.
+        OptionError: hardly any photograph has a reading.
     """
     drawn: list[Crops] = []
     for _ in range(ATTEMPTS * count):
@@ -96,4 +96,4 @@ def draw_crops(
             drawn.append(crop)
         if len(drawn) == count:
             return Crops(*(torch.from_numpy(np.stack(each)) for each in zip(*drawn, strict=True)))
-    raise OptionError(f"hardly any photograph has been read in {readings}: read the teachers first")
+    raise OptionError(f"too few photographs have readings in {readings}: read the teachers first")

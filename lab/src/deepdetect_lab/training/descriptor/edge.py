@@ -1,9 +1,9 @@
-"""The network of a descriptor that published ones teach; it starts as EdgePoint2-L64 (MIT).
+"""The network of a descriptor with published teachers; it starts from EdgePoint2-L64 (MIT).
 
-From real pairs, EdgePoint2 knows changes of season and light that synthetic views do not teach. Its
-maps are read at keypoints instead of being made into a descriptor of every fourth pixel, which
-would take more time than the maps. From the same maps, the network says how well a candidate at a
-point would survive a change of light or view.
+EdgePoint2 was trained on real pairs, with changes of season and light that synthetic views lack.
+Its maps are sampled at keypoints only, because a descriptor for every fourth pixel would take more
+time than the maps. From the same maps, the network predicts a score for each candidate keypoint:
+how well it would survive a change of light or view.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from ..teachers.readings import CODE_LENGTHS
 from .network import KeypointNetwork, double, read_map, shares_of_octaves, size_features
 
 EDGE_CHANNELS = (8, 16, 48, 64)
-"""Numbers of channels at 1/2, 1/4, 1/8 and 1/32 of the size of an octave, as the published weights
-of EdgePoint2-L64 have them."""
+"""Numbers of channels at 1/2, 1/4, 1/8 and 1/32 of the size of an octave, as in the published
+weights of EdgePoint2-L64."""
 
 CONTEXT_CHANNELS, GROUP = 64, 16
-"""Channels of our map at 1/8, and those of a group in its convolution. Without groups the network
-would take 8 % more time, with 96 channels 6 %."""
+"""Channels of our map at 1/8 of an octave's size, and channels per group of its convolution. The
+network would take 8 % more time without groups, and 6 % more with 96 channels."""
 
 HIDDEN = 128
 """Hidden units of the perceptron. With 160, a descriptor would take 4 % more time."""
 
 SCORE_CHANNELS = 8
-"""Channels from which scores are computed at 1/4 of the size. At 1/2, they would take 3 ms more."""
+"""Channels that give the scores at 1/4 of an octave's size; scores at 1/2 would take 3 ms more."""
 
 VARIANCE = 1e-5
-"""What is added to variances of images and of layers, as the published weights expect it."""
+"""Added to the variances in image and batch normalisation, as the published weights expect."""
 
 BACKBONE = "at_half", "around_half", "block"
-"""How the names of EdgePoint2's layers begin."""
+"""Name prefixes of the layers that start from EdgePoint2's weights."""
 
 PUBLISHED = {
     "at_half": "block1.0.layer.0",
@@ -54,8 +54,8 @@ PUBLISHED = {
     "block_coarsest.second": "block3.layer.3",
     "block_coarsest.skip": "block3.skip",
 }
-"""Names of our layers, and of the convolutions of EdgePoint2 with which they start. The next layer
-in a sequence `layer` is the batch normalisation of its result."""
+"""Names of our layers, and of EdgePoint2's convolutions whose weights they start from. The layer
+after a convolution in a sequence `layer` is its batch normalisation."""
 
 
 class Residual(nn.Module):
@@ -74,8 +74,8 @@ class Residual(nn.Module):
 class Halved(nn.Module):
     """A residual block whose result has half of the width and the height.
 
-    EdgePoint2 computes the sum at every pixel, and takes the mean of each 2x2 pixels after ReLU. To
-    take the mean before it saves a tenth of the network's time and costs nothing.
+    EdgePoint2 computes the sum at every pixel, and takes the mean of each 2x2 pixels after ReLU.
+    Taking the mean before ReLU saves a tenth of the network's time and costs nothing.
     """
 
     def __init__(self, channels: int) -> None:
@@ -88,7 +88,7 @@ class Halved(nn.Module):
 
 
 class EdgeNetwork(KeypointNetwork):
-    """A network that describes and scores keypoints, and predicts the codes of its teachers.
+    """A network that describes and scores keypoints, and predicts the descriptors of its teachers.
 
     It takes luma images whose sides are multiples of 128. EdgePoint2's batch normalisation is
     folded into its layers.
@@ -120,7 +120,7 @@ class EdgeNetwork(KeypointNetwork):
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return two feature maps of each octave, at 1/4 and 1/8 of its size.
 
-        The second one also contains context from a map at 1/32.
+        The map at 1/8 also contains context from a map at 1/32.
         """
         mean = luma.mean((2, 3), keepdim=True)
         variance = (luma - mean).square().mean((2, 3), keepdim=True)
@@ -137,7 +137,7 @@ class EdgeNetwork(KeypointNetwork):
         return result
 
     def scores(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
-        """Return scores (B, N), logits: the higher, the better a candidate survives changes."""
+        """Return scores (B, N) as logits. Candidates with higher scores survive changes better."""
         parts: list[Tensor] = []
         for octave, (quarter, eighth) in enumerate(maps):
             coarse = double(self.score_eighth(eighth.float()))
@@ -150,7 +150,7 @@ class EdgeNetwork(KeypointNetwork):
         return result
 
     def start_from(self, path: Path) -> None:
-        """Take over the layers of EdgePoint2-L64, from the authors' file `L64.pth`.
+        """Load the weights of EdgePoint2-L64 from the authors' file `L64.pth`.
 
         Raises:
             WeightsError: the file is missing or holds another network.
@@ -173,7 +173,7 @@ class EdgeNetwork(KeypointNetwork):
 
 
 def _folded(stored: dict[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
-    """Return kernels and bias of a convolution with the batch normalisation that follows it."""
+    """Fold a convolution's batch normalisation into its kernel and bias; return these two."""
     weight = stored[f"{name}.weight"]
     sequence, _, place = name.rpartition(".")
     if not place.isdigit():

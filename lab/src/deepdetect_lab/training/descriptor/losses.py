@@ -43,7 +43,7 @@ def describe_views(network: KeypointNetwork, batch: Pair) -> tuple[Tensor, Tenso
 
 
 def maps_of(network: KeypointNetwork, images: Tensor) -> list[list[Tensor]]:
-    """Return the maps of images (B, S, S) uint8, computed in bfloat16."""
+    """Return the network's feature maps of images (B, S, S) uint8, computed in bfloat16."""
     values = images[:, None].float() / 255
     with torch.autocast(images.device.type, torch.bfloat16):
         return network.maps(values.contiguous(memory_format=torch.channels_last))

@@ -1,7 +1,7 @@
 """The network of the learned descriptor: feature maps of the whole image, sampled at keypoints.
 
 `DescriptorNetwork.maps` computes feature maps at 1/2 to 1/16 of the image size, with the same
-kernels for three octaves: the image, and the image reduced to 1/2 and 1/4. `describe` samples the
+kernels for three octaves: the image, and the image reduced to 1/2 and 1/4. `features` samples the
 maps of the first octave and of the octave that fits the keypoint's size. A perceptron maps the
 samples to 64 numbers: 16 that do not change when the image is rotated, and 48 that rotate with the
 image (`deepdetect.features.learned`).
@@ -20,8 +20,8 @@ from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, 
 from deepdetect.features.learned import CONSTANT, FREQUENCIES, LENGTH
 
 HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
-"""`HIDDEN` is the number of hidden units of the perceptron. The others are the numbers of channels
-of feature maps, from 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`)."""
+"""`HIDDEN` is the number of hidden units of the perceptron. The other constants are numbers of
+channels of feature maps, from 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`)."""
 
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
@@ -85,21 +85,21 @@ class Halving(nn.Module):
 
 
 class KeypointNetwork(nn.Module):
-    """A network that reads feature maps at keypoints, and makes descriptors of what it reads.
+    """A network that samples feature maps at keypoints, and makes descriptors from the samples.
 
     Attributes:
         octaves: number of octaves of which `maps` makes feature maps.
-        strides: distances between the values of each map of an octave, in its pixels.
+        strides: stride of each map of an octave, in pixels of the octave.
     """
 
     octaves: int
     strides: tuple[int, ...]
 
     def add_perceptron(self, channels: int, hidden: int) -> None:
-        """Add the layers that make descriptors of what the maps have at keypoints.
+        """Add the layers that make descriptors from the samples of the maps.
 
-        `channels` is the number of channels of all maps of an octave, `hidden` that of hidden
-        units.
+        `channels` is the total number of channels of an octave's maps, `hidden` the number of
+        hidden units.
         """
         self.input = nn.Linear(2 * channels, hidden)
         self.by_size = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 2 * hidden))
@@ -107,7 +107,7 @@ class KeypointNetwork(nn.Module):
         nn.init.zeros_(self.get_parameter("by_size.2.bias"))
         self.norm, self.middle_norm = nn.BatchNorm1d(hidden), nn.BatchNorm1d(hidden)
         self.middle, self.output = nn.Linear(hidden, hidden), nn.Linear(hidden, LENGTH)
-        self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # of the loss
+        self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # log(1 / t) in the loss
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return the feature maps of each octave."""
@@ -125,7 +125,7 @@ class KeypointNetwork(nn.Module):
         return normalize(self.output(features), dim=1).unflatten(0, xy.shape[:2])
 
     def features(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
-        """Return (B * N, H) hidden units at keypoints, of which the descriptors are made."""
+        """Return (B * N, H) hidden units at keypoints, from which `code` makes descriptors."""
         octaves = [
             torch.cat(
                 [
@@ -186,7 +186,7 @@ class DescriptorNetwork(KeypointNetwork):
 
 
 def shares_of_octaves(sizes: Tensor, octaves: int) -> tuple[Tensor, ...]:
-    """Return the share of each octave, (B, N, 1), in what is read at keypoints of sizes (B, N)."""
+    """Return the weight of each octave, (B, N, 1), in the samples at keypoints of sizes (B, N)."""
     sizes = sizes.clamp(min=SMALLEST_SIZE_PX)
     own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, octaves - 1)[..., None]
     shares = (1 - (own - torch.arange(octaves, device=sizes.device)).abs()).clamp(min=0)
@@ -194,7 +194,7 @@ def shares_of_octaves(sizes: Tensor, octaves: int) -> tuple[Tensor, ...]:
 
 
 def size_features(sizes: Tensor) -> Tensor:
-    """Return functions (B, N, 3) of sizes (B, N), from which perceptrons learn."""
+    """Return three features (B, N, 3) of keypoint sizes (B, N), as input of a perceptron."""
     scale = (sizes.clamp(min=SMALLEST_SIZE_PX) / SMALLEST_SIZE_PX).log()[..., None]
     return torch.cat([scale - 0.7, (scale - 0.7) ** 2 - 0.3, (scale * 3).sin()], -1)
 

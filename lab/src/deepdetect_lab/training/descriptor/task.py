@@ -59,7 +59,7 @@ def pairs_to_draw(
 
 
 def draw_numbered(files: Sequence[Path], *seed: int) -> Pair:
-    """Draw the pair of a seed; raise an OptionError if the images have too little detail."""
+    """Draw the pair that a seed determines; raise an OptionError for images of little detail."""
     generator = np.random.default_rng(seed)
     return draw_until_seen(lambda: draw_pair(generator, files))
 
@@ -135,7 +135,7 @@ class DescriptorTrainer(Trainer):
         self.average = copy.deepcopy(self.network).eval()
         self.network.train()
         # Muon suits layers between many features. AdamW trains the other parameters: the first
-        # layer, the layers that take the keypoint's size or give few numbers, and vectors.
+        # layer, the layers that take the keypoint's size or have few outputs, and vectors.
         groups: dict[tuple[bool, float], list[Any]] = {}
         for name, parameter in self.network.named_parameters():
             kernel = parameter.ndim > 1 and not name.startswith(self.no_kernels)
@@ -166,7 +166,7 @@ class DescriptorTrainer(Trainer):
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
 
-        `pairs` are those that no earlier step has used, or None; `numbers` are their numbers.
+        `pairs` holds the pairs that no earlier step has used, or None; `numbers` identifies them.
         """
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(
@@ -180,7 +180,7 @@ class DescriptorTrainer(Trainer):
     def loss(self, batch: tuple[int, list[int], Pair | None]) -> Tensor:
         """Return the loss of the pairs that a step trains on.
 
-        `batch` holds the number of the step and its new pairs. They replace the oldest pairs in
+        `batch` holds the number of the step and its new pairs. These replace the oldest pairs in
         `window`, a buffer on the device, which already holds the other pairs of the step.
         """
         step, numbers, pairs = batch

@@ -1,4 +1,4 @@
-"""Training of a descriptor that published ones teach: their readings beside our pairs of views."""
+"""Training of a descriptor on readings of published networks and on pairs of synthetic views."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from .teaching import PAIR_WEIGHT, crop_losses, measure_teaching
 from .views import Pair
 
 BACKBONE_RATE = 0.5
-"""Factor of the learning rate of the layers that start as EdgePoint2's, so that they keep more of
-what real pairs have taught them than the new ones of their random weights. Chosen by hand."""
+"""Factor of the learning rate of the layers that start from EdgePoint2's weights, so that they keep
+more of what EdgePoint2 learned from real pairs. Chosen by hand."""
 
 DECAY_SHARE = 0.82
-"""The learning rate falls linearly to 0 over this last share of the steps. It is longer than that
-of pairs alone, because weights that start well gained little in 1,300 steps at the highest rate,
-and more in the next 1,000, in which it fell to 0.87 of that."""
+"""The learning rate falls linearly to 0 over this last share of the steps. The share is larger than
+in training on pairs alone: good initial weights gained little in 1,300 steps at the highest rate,
+and more in the next 1,000 steps, in which the rate fell to 0.87 of the highest."""
 
 VAL_CROPS = 8
-"""Batches of crops for validation, with as many crops as a step has. Chosen by hand."""
+"""Number of validation batches of crops, each as large as that of a step. Chosen by hand."""
 
 
 class TaughtDataset(Dataset[tuple[tuple[int, list[int], Pair | None], Crops]]):
-    """The new pairs of each step, and crops of the photographs that have been read by then."""
+    """The new pairs of each step, and crops of photographs that have a reading at that time."""
 
     def __init__(
         self, files: Sequence[Path], options: DescriptorTrainingOptions, readings: Path
@@ -53,7 +53,7 @@ class TaughtDataset(Dataset[tuple[tuple[int, list[int], Pair | None], Crops]]):
 class TaughtTrainer(DescriptorTrainer):
     """Training of an `EdgeNetwork` on pairs of views, and on readings of its teachers.
 
-    A run that starts before all photographs are read depends on when each is read.
+    If a run starts before all readings are written, its result depends on when each is written.
     """
 
     purpose = (
@@ -64,7 +64,7 @@ class TaughtTrainer(DescriptorTrainer):
         "Share of the keypoints whose match, a mutual nearest neighbour, is correct within 3 px, "
         "for each kind of pairs of views of the validation images; mean cosine to the whitened "
         "codes of both teachers, share of the points whose predicted code is nearest to their own; "
-        "correlation of scores with the second teacher's; the score is the mean of the first five"
+        "correlation of scores with those of ALIKED; the score is the mean of the first five"
     )
     kind_of_network = EdgeNetwork
     no_kernels = ("at_half", "by_size", "score")
@@ -102,7 +102,7 @@ class TaughtTrainer(DescriptorTrainer):
         return BACKBONE_RATE if name.startswith(BACKBONE) else 1.0
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader as of a `DescriptorTrainer`, each step with its crops."""
+        """Return a loader like that of a `DescriptorTrainer`, with the crops of each step."""
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(
             TaughtDataset(self.files, self.options, self.readings),

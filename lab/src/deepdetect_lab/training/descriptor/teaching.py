@@ -1,4 +1,4 @@
-"""The losses of a network that is taught: codes and order of the teachers, and pairs of views."""
+"""The losses by which a network learns its teachers' descriptors (codes) and order of points."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from .losses import maps_of
 from .network import turn
 
 PAIR_WEIGHT, CODE_WEIGHT, RELATION_WEIGHT, NEIGHBOUR_WEIGHT = 5.0, 14.0, 45.0, 3.0
-"""Weights of the contrastive loss of pairs, of 1 - cosine to the teachers' codes, of the squared
-differences of similarities within a photograph, and of the differences of which codes there are
-most similar. With weight 1 of pairs, zoomed ones lost a third of their matches. With the other
-weights a third smaller, the share of the points of photos/val whose predicted code is nearest to
-their own rose by 0.001 in 1,000 steps, and with these and a falling rate by 0.005 in the next
-1,200."""
+"""Weights of four losses: the contrastive loss of pairs, 1 - cosine to the teachers' codes, squared
+differences of the similarities of codes within a photograph, and differences of nearest neighbours.
+With pair weight 1, zoomed pairs lost a third of their matches. With the other three weights a third
+smaller, the share of points of photos/val whose predicted code is nearest to their own code rose by
+0.001 in 1,000 steps. With these weights and a falling learning rate, it rose by 0.005 in the next
+1,200 steps."""
 
 SHARPNESS = 10.0
-"""Similarities are multiplied by it before a softmax turns them into shares of neighbours, so that
-a similarity 0.1 below the highest counts a third as much. Chosen by hand."""
+"""Similarities are multiplied by this factor before a softmax over the neighbours, so that a
+neighbour with a similarity 0.1 below the highest counts a third as much. Chosen by hand."""
 
 SAME = 1e-6
-"""Similarities that differ by less are the same: a point may be drawn twice."""
+"""Similarities that differ by less than this count as equal, since a point may be drawn twice."""
 
 
 def crop_losses(network: EdgeNetwork, crops: Crops) -> dict[str, Tensor]:
@@ -50,21 +50,21 @@ def crop_losses(network: EdgeNetwork, crops: Crops) -> dict[str, Tensor]:
 def predict_codes(network: EdgeNetwork, code: Tensor, crops: Crops) -> Tensor:
     """Return (B, N, 192) predicted codes of the teachers, of length 1.
 
-    The teachers have seen the photographs upright, so the descriptors are turned back.
+    The teachers have seen the photographs upright, so the descriptors are rotated back.
     """
     return normalize(network.teach(turn(code, -crops.turn[:, None])), dim=-1)
 
 
 def without_self(similarities: Tensor) -> Tensor:
-    """Return (B, N, N) similarities of which none is of a point with itself."""
+    """Set the similarity of each point to itself to -1, in similarities (B, N, N)."""
     own = torch.eye(similarities.shape[1], dtype=torch.bool, device=similarities.device)
     return similarities.masked_fill(own, -1)
 
 
 def neighbours_differ(found: Tensor, known: Tensor) -> Tensor:
-    """Return how the nearest neighbours by two tables (B, N, N) of similarities differ.
+    """Return how much the nearest neighbours differ between two similarity matrices (B, N, N).
 
-    It is the mean Kullback-Leibler divergence of the softmax of their rows.
+    The measure is the mean Kullback-Leibler divergence of the softmax of their rows.
     """
     chances, wanted = (log_softmax(SHARPNESS * each, -1).flatten(0, 1) for each in (found, known))
     return kl_div(chances, wanted, reduction="batchmean", log_target=True)

@@ -57,7 +57,7 @@ JITTER_PX = 0.5
 
 SIZE_ERRORS, SMALL_ERROR_SHARE = (0.12, 0.4), 0.6
 """Keypoint sizes in the second view get random errors. The standard deviation of the log size is
-the first of `SIZE_ERRORS` for `SMALL_ERROR_SHARE` of the keypoints, and the second for the rest."""
+`SIZE_ERRORS[0]` for the share `SMALL_ERROR_SHARE` of the keypoints, and `SIZE_ERRORS[1]` else."""
 
 PLACE_ERROR_PX, PLACE_ERROR_PER_SIGMA, PLACE_ERROR_SIGMA = 0.225, 0.162, 6.0
 """Keypoint positions in the second view get random errors. Their standard deviation in pixels is

@@ -35,7 +35,7 @@ BISECTIONS = 40
 
 
 def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
-    """Return the loss of a pair of views, averaged over the directions from each to the other.
+    """Return the loss of a pair of views, averaged over both directions between the views.
 
     The gradient keeps the number of keypoints fixed: a candidate that becomes more likely displaces
     candidates near the selection threshold, so their mean reward is subtracted from its own reward.
@@ -56,7 +56,7 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
 
 
 def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
-    """Return the probability (N,) to choose a candidate: 0 if a close one has a larger logit."""
+    """Return selection probabilities (N,), 0 where a close candidate has a larger logit."""
     logits = ranker(torch.from_numpy(view.features))
     radii = least_distances(view.sigma_px)  # the same as in detection
     kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))

@@ -30,8 +30,8 @@ from ..synthetic import (
 KINDS = ("zoom", "blur", "viewpoint", "light")
 
 BORDER_PX = 4
-"""A view is not valid near the border of the photograph, because mirrored pixels are close. The
-margin is this number of pixels of the photograph, plus as many pixels of the view."""
+"""Pixels of a view are not valid near the photograph's border, because mirrored pixels are close.
+The margin is this number of pixels of the photograph, plus as many pixels of the view."""
 
 SUPERSAMPLING = 2
 """Views are rendered with twice the pixels along each side, so that they are not aliased."""
@@ -40,8 +40,8 @@ MAX_ENLARGEMENT = 2.2
 """Zoomed views enlarge the photograph by at most this factor, because more would only show blur."""
 
 SUBTLE = 0.25
-"""Probability that a view of another kind than "blur" is also blurred weakly. Weak changes of light
-and weak JPEG compression are added to views of other kinds likewise. Chosen by hand."""
+"""Probability that a view of another kind than "blur" is also blurred weakly. Views of other kinds
+than "light" get weak changes of light and weak JPEG compression as often. Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),

@@ -1,1 +1,1 @@
-"""Published descriptor networks, read at our points, for the training of our own descriptor."""
+"""Published descriptor networks, evaluated at our keypoints, as teachers of our own descriptor."""

@@ -1,4 +1,4 @@
-"""ALIKED-n16rot in plain torch, to be read at given points.
+"""ALIKED-n16rot in plain torch, to describe and score given points.
 
 The layers and their names are those of the authors' weights file `models/aliked-n16rot.pth`
 (github.com/Shiaoming/ALIKED, BSD-3-Clause, copyright 2022 Zhao Xiaoming). Paper: Zhao et al.,
@@ -25,7 +25,7 @@ from torch.nn.functional import (
 from deepdetect._shared.errors import MissingWeightsError
 
 LENGTH = 128
-"""A descriptor has 128 numbers, because the published weights have them."""
+"""Length of a descriptor, as in the published weights."""
 
 KERNEL, SAMPLES = 3, 16
 """Convolutions cover 3x3 pixels, and 16 samples make a descriptor, as in the published weights."""
@@ -34,10 +34,10 @@ MULTIPLE = 32
 """The network reduces an image by 32, so images are padded to multiples of 32 pixels."""
 
 REACH = 0.25
-"""Samples lie within a quarter of the longer side of the map, as the paper's code limits them."""
+"""Offsets of samples are at most a quarter of the map's longer side, as in the paper's code."""
 
 SCORE_WINDOW = 5
-"""The score of a point is the highest within 2 pixels, because two detectors differ by so much."""
+"""A point gets the highest score within 2 px, since positions of two detectors differ by that."""
 
 
 class DeformableConvolution(nn.Module):
@@ -62,7 +62,7 @@ class DeformableConvolution(nn.Module):
 
 
 class Block(nn.Module):
-    """Two convolutions, and in a `residual` block a further connection around them."""
+    """Two convolutions; a `residual` block also adds its input, mapped by a 1x1 convolution."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class DescriptorHead(nn.Module):
 
 
 class Aliked(nn.Module):
-    """ALIKED-n16rot, without its own choice of points."""
+    """ALIKED-n16rot, without its own keypoint detection."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -173,6 +173,6 @@ def _plain(inputs: int, outputs: int) -> nn.Module:
 
 
 def _sample(features: Tensor, places: Tensor) -> Tensor:
-    """Sample maps bilinearly at places (1, H, W, 2), in pixels; outside the maps there is 0."""
+    """Sample maps bilinearly at positions (1, H, W, 2), in pixels; samples outside are 0."""
     size = torch.tensor([features.shape[3], features.shape[2]]) - 1
     return grid_sample(features, 2 * places / size - 1, align_corners=True)

@@ -1,4 +1,4 @@
-"""Readings: what published networks say of our points of a photograph, in one file for each."""
+"""Readings: outputs of published networks (teachers) at keypoints, one file per photograph."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from deepdetect.io.image import load_image, luma
 from .aliked import SCORE_WINDOW, load_aliked
 
 POINTS, STRONG_SHARE, STRONG_DENSITY = 1280, 0.5, 2048 / (640 * 480)
-"""A reading has at most 1,280 points, because each takes 400 bytes. Half of them are from the best
-of a photograph, as many for each pixel as 2,048 in 640x480, and half from all others, because weak
-ones are described where 8,192 are wanted."""
+"""A reading has at most 1,280 points, because each takes 400 bytes. Half of them are drawn from the
+best-ranked points, as many per pixel as 2,048 in 640x480. The other half is drawn from all weaker
+points, because these are also described if 8,192 keypoints are requested."""
 
 EDGEPOINT_MULTIPLE = 32
-"""EdgePoint2 takes images whose sides are multiples of 32, since it reduces them by as much."""
+"""EdgePoint2 takes images whose sides are multiples of 32, since it reduces them by this factor."""
 
 
 class Reading(NamedTuple):
-    """What the teachers say of points of a photograph.
+    """The outputs of the teachers at keypoints of a photograph.
 
     Attributes:
         luma: the photograph, (H, W) uint8.
         xy: positions (N, 2) float32, in pixels.
         sizes: diameters (N,) float32, in pixels.
-        places: (N,) int64 places of the points in the ranker's order of all points, from 0.
+        places: (N,) int64 ranks of the points in the ranker's order of all points, from 0.
         codes: (N, 192) float16 descriptors: 64 numbers of EdgePoint2 and 128 of ALIKED, each part a
             unit vector.
         scores: (N, 2) float16 scores of EdgePoint2 (logits) and ALIKED (in [0, 1]), the highest
@@ -54,35 +54,35 @@ class Reading(NamedTuple):
 
 
 CODE_LENGTHS = (64, 128)
-"""Numbers of a code of EdgePoint2-E64 and of ALIKED-n16rot, as the published weights have them."""
+"""Lengths of the descriptors of EdgePoint2-E64 and ALIKED-n16rot, as in the published weights."""
 
 EDGEPOINT_WEIGHT, WHITENING = 0.6, 0.75
-"""EdgePoint2's part of a whitened code has 0.6 of the length of ALIKED's, and the deviation along
-each axis is divided by its own power 0.75. So whitened, both codes side by side have 913 correct
-matches in a pair of webcam images, and 885 as they are published."""
+"""EdgePoint2's part of a whitened code has 0.6 times the length of ALIKED's part. Values along an
+axis are divided by their standard deviation to the power 0.75. In a pair of webcam images, both
+descriptors together give 913 correct matches if whitened, and 885 as published."""
 
 SOME_READINGS, SOME_POINTS = 256, 80
-"""Means and axes are those of about 80 points of each of 256 readings: 20,480 codes, a hundred for
-each of their 192 numbers, so that they hardly depend on which photographs have been read."""
+"""Means and axes of the whitening are computed from about 80 points of each of 256 readings: 20,480
+codes, a hundred for each of the 192 values, so that the choice of photographs hardly matters."""
 
 SMALLEST_SHARE = 1e-3
-"""This share of the largest variance is added to the variance along each axis, so that no axis of
-noise is amplified more than 13 times as much as the axis with that variance."""
+"""This share of the largest variance is added to the variance along each axis, so that noise along
+an axis is amplified at most 13 times as much as values along the axis of largest variance."""
 
 
 class Whitening:
-    """Codes of both teachers as one vector, (..., 192) of length 1, whose numbers have mean 0.
+    """A map from codes of both teachers to joint unit vectors (..., 192) with more even variances.
 
-    Published codes of different points are similar, since their mean is not zero: the cosine of two
-    of EdgePoint2's is 0.55. Without the mean, and with more even variances, more points match.
+    Published codes of different points are similar, since their mean is not zero: two codes of
+    EdgePoint2 have a cosine of 0.55. With mean 0 and more even variances, more points match.
 
     Raises:
-        OptionError: there are no readings.
+        OptionError: no reading is given.
     """
 
     def __init__(self, readings: Sequence[Path]) -> None:
         if not readings:
-            raise OptionError("no photograph has been read: read the teachers first")
+            raise OptionError("no photograph has a reading: read the teachers first")
         chosen = readings[:: max(1, len(readings) // SOME_READINGS)]
         codes = [load_reading(path).codes[:: POINTS // SOME_POINTS] for path in chosen]
         values = torch.from_numpy(np.concatenate(codes).astype(np.float32))
@@ -106,9 +106,9 @@ class Whitening:
 class Teachers:
     """EdgePoint2-E64 and ALIKED-n16rot.
 
-    `edgepoint` is EdgePoint2's network as an ONNX file: `image` (1, 1, H, W), the mean of RGB in
-    [0, 1], to `scores` (1, 1, H, W) and `descriptors` (1, 64, H/4, W/4). `aliked` is the authors'
-    file of weights.
+    `edgepoint` is an ONNX file that maps `image` (1, 1, H, W), the mean of RGB in [0, 1], to
+    `scores` (1, 1, H, W) and `descriptors` (1, 64, H/4, W/4). `aliked` is the authors' file of
+    weights.
     """
 
     def __init__(self, edgepoint: Path, aliked: Path, threads: int = 1) -> None:
@@ -145,7 +145,7 @@ class Teachers:
 def choose_points(
     gray: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose points of a photograph at random, strong and weak ones: positions, sizes, places."""
+    """Choose strong and weak keypoints at random; return their positions, sizes and ranks."""
     candidates, logits = rank_candidates(gray)
     kept = suppress_neighbors(candidates.xy, logits, least_distances(candidates.sigma_px))
     best = min(len(kept), round(STRONG_DENSITY * gray.size))
@@ -158,7 +158,7 @@ def choose_points(
 
 
 def read_photograph(teachers: Teachers, image: object, seed: int = 0) -> Reading:
-    """Read the teachers at points of a photograph, in any form that `load_image` accepts."""
+    """Run the teachers at keypoints of a photograph in any form that `load_image` accepts."""
     rgb = load_image(image)
     gray = luma(rgb)
     xy, sizes, places = choose_points(gray, np.random.default_rng(seed))
@@ -177,7 +177,7 @@ def write_readings(
 ) -> Iterator[int]:
     """Write the missing readings of photographs; yield the number of points of each.
 
-    Each file appears whole or not at all, so an interrupted call may be made again.
+    Files are written atomically, so an interrupted call can be repeated.
     """
     left = [image for image in images if not reading_file(image, folder).exists()]
     with progress(len(left), "reading", "photograph", quiet) as bar:
