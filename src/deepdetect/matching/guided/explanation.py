@@ -14,12 +14,12 @@ from ...features.matches import MAX_KEYPOINT_DISTANCE_PX, GuidedMatches, TwoView
 from ...features.matches import Evidence as PublicEvidence
 from ...features.matches import Layer as PublicLayer
 from ...geometry.camera import Size
-from ...geometry.estimation import log10_nfa, measure_parallax
+from ...geometry.estimation import log10_nfa
 from ...geometry.images import edge_strength
 from ...geometry.lens import UNDISTORT, distortion
 from ...geometry.transforms import outer_corners, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
-from .along_plane import MIN_ALIGNED, PlaneTracks, match_along_plane
+from .along_plane import PlaneTracks, match_along_plane
 from .along_rows import match_by_rectification
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
@@ -412,15 +412,8 @@ def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
 def _is_deep(flat: Layer, seed: int) -> bool:
     """Return whether a scene has depth that a plane does not explain."""
     assert flat.tracks is not None
-    parallax, matches = flat.tracks.parallax(seed), flat.hypothesis.tentative
-    if parallax.shows_depth:
-        return True
-    # Tracks are lost where the parallax is large, and matches are not.
-    ends = matches.points0, matches.points1
-    of_matches = measure_parallax(*ends, flat.hypothesis.matrix, seed)
-    if flat.evidence.share < NEARLY_ALL:
-        return parallax.shows_foreground or of_matches.shows_depth
-    return of_matches.shows_depth and of_matches.agreeing >= MIN_ALIGNED * of_matches.off_plane
+    parallax = flat.tracks.parallax(seed)
+    return parallax.shows_depth or (flat.evidence.share < NEARLY_ALL and parallax.shows_foreground)
 
 
 def _is_doubtful(flat: Layer, epipolar: Hypothesis) -> bool:
