@@ -19,7 +19,7 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
-from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
+from ...geometry.epipolar_rectification import RectifiedFrame, rectified_frame
 from ...geometry.images import (
     MAX_ROUND_TRIP_PX,
     downscale,
@@ -59,10 +59,6 @@ finer ones, which can be more."""
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """The range of disparities is extended at both ends by this many pixels plus this fraction of its
 length. Chosen on Oxford and others."""
-
-MIN_FRACTION_OF_ONE_SIGN = 0.8
-"""If more than this fraction of the sparse matches in a polar frame has disparities of one sign,
-the range extends only by `MARGIN_PX` into the other sign. Chosen on Oxford and others."""
 
 CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
 """Side of the windows in which rectified views are correlated, and sigma of the preceding blur."""
@@ -275,11 +271,6 @@ def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
     if not len(disparity):
         return 0, 0
     smallest, largest = range_with_margin(disparity, MARGIN_PX, MARGIN_FRACTION)
-    if isinstance(frame, PolarFrame):
-        if np.mean(disparity > 0) > MIN_FRACTION_OF_ONE_SIGN:
-            smallest = max(smallest, -MARGIN_PX)
-        if np.mean(disparity < 0) > MIN_FRACTION_OF_ONE_SIGN:
-            largest = min(largest, MARGIN_PX)
     widest = frame.size[0] - 1
     return max(math.floor(smallest), -widest), min(math.ceil(largest), widest)
 
