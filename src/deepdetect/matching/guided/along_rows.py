@@ -70,9 +70,6 @@ kept if the correlation is above 0: chance gives as many below as above."""
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 """Maximum number of tracked corners, and side of their windows. Chosen on Oxford and others."""
 
-MAX_TRACK_PX = 4.0
-"""Maximum distance of a track's end from the match on its row. Chosen on Oxford and others."""
-
 MIN_TRACKS = 50
 """A pair with fewer tracked corners gets no dense matches. Chosen on Oxford and others."""
 
@@ -293,7 +290,6 @@ def _track(view: RectifiedView) -> Pair | None:
         first, second, start, TRACKED_WINDOW_PX, levels=1, expected=expected
     )
     good = gaps < MAX_ROUND_TRIP_PX
-    good &= np.abs(ends - expected).max(axis=1) < MAX_TRACK_PX * view.step_px
     if np.count_nonzero(good) < MIN_TRACKS:
         return None
     start, ends = start[good], ends[good]
