@@ -63,10 +63,6 @@ length. Chosen on Oxford and others."""
 CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
 """Side of the windows in which rectified views are correlated, and sigma of the preceding blur."""
 
-MIN_CORRELATION = 0.3
-"""Geometry relies on a match if the correlation of its windows is at least this. With less, it is
-kept if the correlation is above 0: chance gives as many below as above."""
-
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 """Maximum number of tracked corners, and side of their windows. Chosen on Oxford and others."""
 
@@ -87,9 +83,8 @@ class RectifiedView:
     """Two rectified images and the disparities between them.
 
     `views` are the images, scaled by `scale`, in the `frame`. `step_px` is the step with which
-    disparities were searched. `disparity` is NaN where no match is
-    kept. `relied` marks matches that geometry may rely on. `correlation` is the local ZNCC of the
-    first view with the second view at its disparity. All arrays are (H, W).
+    disparities were searched. `disparity` is NaN where nothing is matched. `correlation` is the
+    local ZNCC of the first view with the second view at its disparity. All arrays are (H, W).
     """
 
     frame: RectifiedFrame
@@ -97,7 +92,6 @@ class RectifiedView:
     step_px: float
     views: Pair
     disparity: np.ndarray
-    relied: np.ndarray
     correlation: np.ndarray
 
     def to_frame(self, points: np.ndarray, side: int) -> np.ndarray:
@@ -158,7 +152,7 @@ def _best_view(
         tracks = None if view is None else _track(view)
         if view is None or tracks is None:
             continue
-        matched = np.count_nonzero(view.relied) / view.scale**2
+        matched = np.count_nonzero(np.isfinite(view.disparity)) / view.scale**2
         if matched > most:
             best, most = (view, tracks), matched
         if view.step_px <= MAX_STEP_PX:
@@ -192,9 +186,9 @@ def rectified_view(
     (first, shown0), (second, shown1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
     disparity, matched, step_px = _match_rows((first, second), searched)
     correlation = _correlation((first, second), (shown0, shown1), disparity, matched)
-    kept, relied = (matched & (correlation >= bound) for bound in (0, MIN_CORRELATION))
-    disparity = np.where(kept, disparity, np.float32(np.nan))
-    return RectifiedView(frame, scale, step_px, (first, second), disparity, relied, correlation)
+    # Chance gives as many correlations below 0 as above.
+    disparity = np.where(matched & (correlation >= 0), disparity, np.float32(np.nan))
+    return RectifiedView(frame, scale, step_px, (first, second), disparity, correlation)
 
 
 def _volume(frame: RectifiedFrame, sparse: Pair) -> float:
@@ -278,7 +272,7 @@ def _track(view: RectifiedView) -> Pair | None:
     Returns the corners in both images at full size; None with fewer than `MIN_TRACKS` tracks.
     """
     first, second = (equalise(gray) for gray in view.views)
-    mask = view.relied.astype(np.uint8)
+    mask = np.isfinite(view.disparity).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(first, TRACKED_CORNERS, 0.001, 5, mask=mask)
     if corners is None or len(corners) < MIN_TRACKS:
         return None
@@ -299,13 +293,13 @@ def _track(view: RectifiedView) -> Pair | None:
 def _agreement(view: RectifiedView, sparse: Pair) -> float:
     """Return the fraction of sparse matches that agree with the disparity where they start.
 
-    Matches that start where geometry relies on no disparity are left out. If most of the others
-    disagree, rows were matched to similar but wrong places.
+    Matches that start where there is no disparity are left out. If most of the others disagree,
+    rows were matched to similar but wrong places.
     """
     positions = [view.to_frame(points, side) for side, points in enumerate(sparse)]
     inside, column, row = view.pixels_of(positions[0])
     errors = positions[0][inside, 0] - positions[1][inside, 0] - view.disparity[row, column]
-    errors = np.abs(errors[view.relied[row, column] & np.isfinite(errors)])
+    errors = np.abs(errors[np.isfinite(errors)])
     return float((errors < MAX_DISAGREEMENT_PX * view.step_px).mean()) if len(errors) else 0.0
 
 
