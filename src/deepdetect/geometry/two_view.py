@@ -13,7 +13,7 @@ from .estimation import (
     log10_nfa,
     measure_parallax,
 )
-from .semi_calibrated import START_FOCAL_LENGTHS
+from .refinement import START_FOCAL_LENGTHS
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
 """Inlier thresholds in pixels of the models that guide matching. These models are fitted to less

@@ -28,7 +28,7 @@ from ...geometry.images import (
     local_zncc,
     track_round_trip,
 )
-from ...geometry.semi_calibrated import refine_fundamental
+from ...geometry.refinement import refine_fundamental
 from ...geometry.transforms import (
     scaled_fundamental,
     scaled_homography,

@@ -23,7 +23,7 @@ from .along_plane import PlaneTracks, match_along_plane
 from .along_rows import match_by_rectification
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
-from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose, propose_scene
+from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
 
 MIN_MATCHED_FRACTION = 0.02
 """Dense matching has failed if it matches less than this fraction of the keypoints."""
@@ -170,7 +170,7 @@ class Explanation:
         epipolar, refuted = None, np.zeros(len(tentative.points0), bool)
         surely = False
         if self._asked != "homography":
-            epipolar = propose_scene(pair, tentative, self._seed)
+            epipolar = propose(pair, tentative, "fundamental", self._seed)
         sparse: list[Hypothesis] = []
         flats: list[Hypothesis] = []
         if self._asked != "fundamental":

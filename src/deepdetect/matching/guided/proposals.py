@@ -19,7 +19,7 @@ from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
 from ...features.learned import CROSS_MODAL, LEARNED, is_learned, match_learned, ratio_limit
 from ...features.matchers import exact_neighbours, match_descriptors
-from ...geometry.semi_calibrated import estimate_semi_calibrated, refine_fundamental
+from ...geometry.refinement import refine_fundamental
 from ...geometry.transforms import epipolar_errors, scaled_points, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model
 from ...io.image import MINIMUM_SIDE
@@ -56,11 +56,6 @@ that is off by one window in either direction takes two."""
 
 MIN_MATCHES = 8
 """A geometry needs more matches than the seven that any fundamental matrix fits."""
-
-SEMI_CALIBRATED_MATCHES = 200
-"""The fundamental matrix of a scene with fewer matches is also estimated with ordinary cameras,
-which needs fewer correct ones, but not of simulated views: they see one place often, so that their
-matches are not independent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,21 +269,6 @@ def planes(pair: ImagePair, tentative: Tentative, seed: int) -> Iterator[Hypothe
         inliers[rows[found.inliers]] = True
         left &= ~inliers
         yield replace(found, inliers=inliers, tentative=tentative)
-
-
-def propose_scene(pair: ImagePair, tentative: Tentative, seed: int) -> Hypothesis | None:
-    """Estimate the fundamental matrix of a scene, by ordinary cameras if it has few matches."""
-    found = propose(pair, tentative, "fundamental", seed)
-    few = found is None or np.count_nonzero(found.inliers) < SEMI_CALIBRATED_MATCHES
-    if not few or tentative.views or len(tentative.points0) < MIN_MATCHES:
-        return found
-    threshold_px = GUIDING_THRESHOLDS_PX["fundamental"] * tentative.pixel
-    ends = tentative.points0, tentative.points1
-    known = estimate_semi_calibrated(*ends, pair.sizes, threshold_px, seed)
-    least = np.inf if found is None else found.log10_nfa
-    if known is None or known.matrix is None or not known.trusted or known.log10_nfa >= least:
-        return found
-    return Hypothesis("fundamental", known.matrix, known.inliers, known.log10_nfa, tentative)
 
 
 def propose(pair: ImagePair, tentative: Tentative, model: str, seed: int) -> Hypothesis | None:

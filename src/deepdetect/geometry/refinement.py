@@ -1,9 +1,7 @@
-"""Estimate the fundamental matrix of two ordinary cameras whose focal length is not known.
+"""Refine the fundamental matrix of two ordinary cameras whose focal length is not known.
 
-Most pairs have square pixels, principal points near the middle, and similar focal lengths. For each
-of a few focal lengths, RANSAC estimates an essential matrix, because samples of five matches
-instead of seven are more often free of outliers. For the focal length with the best evidence, the
-relative pose and the cameras are then fitted together to the inliers.
+Most pairs have square pixels, principal points near the middle, and similar focal lengths. Pose and
+cameras are fitted together to matches and to this prior.
 """
 
 from __future__ import annotations
@@ -11,93 +9,31 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
 from .camera import Calibration, Camera, Size, cross_matrix
-from .estimation import TwoViewModel, fit_essential, fit_shuffled, log10_nfa
 from .relative_pose import Pose, best_of_four, moved_pose
 from .similarity import MAD_STD
 from .transforms import epipolar_errors, signed_epipolar_errors
 
-MIN_MATCHES, MODELS_PER_SAMPLE = 6, 10
-"""Five matches fit up to MODELS_PER_SAMPLE essential matrices; a sixth match tests them."""
+MIN_MATCHES = 6
+"""Five matches determine a pose; a sixth one also says something of the cameras."""
 
-FOCAL_LENGTHS, START_FOCAL_LENGTHS = (0.7, 1.4), np.geomspace(0.4, 2.5, 12)
-"""Focal lengths in units of the image's longer side. RANSAC is run with each of FOCAL_LENGTHS, as
-good as a dense range from 90 to 28 degrees of view. The refinement of a fundamental matrix starts
-from the one of START_FOCAL_LENGTHS, chosen by hand, that makes the matrix most nearly essential."""
-
-CONFIDENCE, ITERATIONS = 0.9999, 5000
-"""RANSAC stops when, with the probability CONFIDENCE, a sample was free of outliers, or after
-ITERATIONS samples for each focal length. Chosen by hand."""
+START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
+"""Focal lengths in units of the image's longer side. The refinement starts from the one that makes
+the matrix most nearly essential. Chosen by hand."""
 
 FOCAL_SPREAD, FOCAL_DIFFERENCE, PRINCIPAL_POINT_SPREAD = 0.7, 0.03, 0.03
 """Prior standard deviations, in units of the image's longer side: of the mean log focal length from
 0, of the difference of both log focal lengths, and of cx and cy from the middle. Chosen by hand."""
 
-MATCH_SIGMA_PX = 0.5
-"""Standard deviation of the distance of correct matches to epipolar lines. Chosen by hand."""
-
 MIN_SIGMA_PX = 0.1
 """Minimum standard deviation of match errors in `refine_fundamental`. Chosen by hand."""
 
-MAX_FITS, MAX_ITERATIONS = 4, 20
-"""Pose and cameras are fitted to the inliers at most MAX_FITS times, each time with at most
-MAX_ITERATIONS steps of Levenberg-Marquardt. Chosen by hand."""
-
-
-def estimate_semi_calibrated(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    sizes: tuple[Size, Size],
-    inlier_threshold: float = 1.5,
-    seed: int = 0,
-) -> TwoViewModel | None:
-    """Estimate a fundamental matrix from (M, 2) matches, many of which may be wrong.
-
-    The threshold is a Sampson distance in pixels. Returns None if the estimation fails.
-    """
-    points0 = np.asarray(points0, np.float64).reshape(-1, 2)
-    points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    if len(points0) < MIN_MATCHES:
-        return None
-
-    def judge(fundamental: np.ndarray) -> TwoViewModel:
-        inliers = epipolar_errors(points0, points1, fundamental) < inlier_threshold
-        tried = MODELS_PER_SAMPLE * len(FOCAL_LENGTHS)
-        alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
-        return TwoViewModel("fundamental", fundamental, inliers, alarms)
-
-    best = start = None
-    for focal in FOCAL_LENGTHS:
-        cameras = _Cameras.guess(sizes, focal)
-        fit = partial(_fit_essential, cameras=cameras, inlier_threshold=inlier_threshold)
-        essential = fit_shuffled(fit, points0, points1, seed)
-        if essential is None:
-            continue
-        fundamental = cameras.fundamental(essential)
-        fundamental = fundamental / np.linalg.norm(fundamental)
-        model = judge(fundamental)
-        if best is None or model.log10_nfa < best.log10_nfa:
-            best, start = model, (essential, cameras)
-    if best is None or start is None or np.count_nonzero(best.inliers) < MIN_MATCHES:
-        return best
-    essential, cameras = start
-    inliers = points0[best.inliers], points1[best.inliers]
-    views = best_of_four(essential, *inliers, cameras.calibration), cameras
-    for _ in range(MAX_FITS):
-        inliers = points0[best.inliers], points1[best.inliers]
-        views = _fit(views, *inliers, np.full(len(inliers[0]), MATCH_SIGMA_PX))
-        model = judge(_fundamental(*views))
-        if model.log10_nfa > best.log10_nfa:
-            break
-        hopeless = best.log10_nfa == model.log10_nfa > 0
-        best = model
-        if hopeless:  # chance explains the inliers, and their number does not grow
-            break
-    return best
+MAX_ITERATIONS = 20
+"""Maximum number of steps of Levenberg-Marquardt. Chosen by hand."""
 
 
 def refine_fundamental(
@@ -196,15 +132,6 @@ def _fundamental(pose: Pose, cameras: _Cameras) -> np.ndarray:
 def _moved(views: Views, change: np.ndarray) -> Views:
     pose, cameras = views
     return moved_pose(pose, change[:5]), cameras.moved(change[5:])
-
-
-def _fit_essential(
-    points0: np.ndarray, points1: np.ndarray, cameras: _Cameras, inlier_threshold: float
-) -> np.ndarray | None:
-    camera0, camera1 = cameras.calibration.camera0, cameras.calibration.camera1
-    focal_px = (camera0.focal_px[0] + camera1.focal_px[0]) / 2
-    rays = camera0.rays(points0), camera1.rays(points1)
-    return fit_essential(*rays, focal_px, inlier_threshold, CONFIDENCE, ITERATIONS)
 
 
 def _fit(views: Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> Views:

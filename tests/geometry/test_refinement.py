@@ -1,4 +1,4 @@
-"""Fundamental matrices of partly known cameras, from few and mostly wrong matches."""
+"""Fundamental matrices of partly known cameras, refined by matches."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import pytest
 
 from deepdetect.geometry import GeometryOptions, epipolar_errors, estimate_geometry
 from deepdetect.geometry.camera import Calibration, Camera, fundamental_matrix
-from deepdetect.geometry.estimation import MAX_LOG10_NFA, log10_nfa
-from deepdetect.geometry.semi_calibrated import estimate_semi_calibrated, refine_fundamental
+from deepdetect.geometry.refinement import refine_fundamental
 
 SIZE = (1200, 800)
 SIZES = (SIZE, SIZE)
@@ -43,53 +42,9 @@ def matches(
     return first, second, fundamental_matrix(Calibration(*cameras), turn, motion)
 
 
-@pytest.mark.parametrize("motion", [SIDEWAYS, FORWARD], ids=["sideways", "forward"])
-@pytest.mark.parametrize("focal", [0.55, 0.9, 1.8])
-def test_three_of_ten_right_matches_are_enough(focal: float, motion: np.ndarray) -> None:
-    first, second, true = matches(30, 70, focal, motion)
-    found = estimate_semi_calibrated(first, second, SIZES)
-    assert found.log10_nfa < MAX_LOG10_NFA
-    assert found.inliers[:30].mean() > 0.6
-    assert found.inliers[30:].mean() < 0.15
-    unseen = matches(300, 0, focal, motion, noise=0, seed=1)
-    assert np.median(epipolar_errors(*unseen[:2], true)) < 1e-6
-    assert np.median(epipolar_errors(*unseen[:2], found.matrix)) < 2
-
-
-def test_five_points_are_trusted_where_seven_are_not() -> None:
-    """What it is for: one right match of five."""
-    seven, five = [], []
-    for seed in range(3):
-        first, second, _ = matches(18, 72, seed=seed)
-        options = GeometryOptions(inlier_threshold=1.5)
-        plain = estimate_geometry(first, second, seed=seed, options=options).matrix
-        near = epipolar_errors(first, second, plain) < 1.5
-        seven.append(log10_nfa(near, "fundamental", 1.5, SIZE))
-        found = estimate_semi_calibrated(first, second, SIZES, seed=seed)
-        five.append(found.log10_nfa)
-    assert min(seven) > 0
-    assert np.median(five) < -3
-
-
-@pytest.mark.parametrize("count", [20, 100])
-def test_random_matches_are_never_trusted(count: int) -> None:
-    for seed in range(2):
-        first, second, _ = matches(6, count, seed=seed)
-        found = estimate_semi_calibrated(first[6:], second[6:], SIZES, seed=seed)
-        assert found.log10_nfa > 0
-
-
-def test_images_of_different_sizes() -> None:
-    sizes = ((1200, 800), (500, 640))
-    first, second, _ = matches(40, 40, sizes=sizes)
-    found = estimate_semi_calibrated(first, second, sizes)
-    assert found.inliers[:40].mean() > 0.9
-
-
 @pytest.mark.parametrize("count", [0, 5])
-def test_too_few_matches_give_nothing(count: int) -> None:
+def test_too_few_matches_change_nothing(count: int) -> None:
     first, second, true = matches(8, 0)
-    assert estimate_semi_calibrated(first[:count], second[:count], SIZES) is None
     kept = refine_fundamental([(first[:count], second[:count])], true, SIZES)
     np.testing.assert_array_equal(kept, true)
 
