@@ -138,6 +138,8 @@ class Explanation:
             further = next(self._confirmed(tentative.chosen(free), ~explained), None)
             if further is None or not further.dense:
                 break
+            if further.hypothesis.log10_nfa >= MAX_SPARSE_LOG10_NFA:
+                break
             layers.append(further)
             explained = explained | further.evidence.explained
         layers.sort(key=lambda layer: -layer.evidence.windows)
