@@ -213,7 +213,7 @@ class Explanation:
                 yield deep
             else:
                 sparse.append(epipolar)
-        if flat is not None and (part is None or part.evidence.share >= MOST):
+        if flat is not None and part is None:
             yield flat
         nothing = free is None and flat is None and epipolar is None
         self.refuted = nothing and surely
