@@ -169,7 +169,7 @@ class Explanation:
     def _confirmed(self, tentative: Tentative, free: np.ndarray | None = None) -> Iterator[Layer]:
         """Yield layers that the images confirm, the best first, then sparse ones."""
         pair, judge = self._seen(tentative.cross_modal)
-        epipolar, refuted = None, np.zeros(len(tentative.points0), bool)
+        epipolar, (refuted, chance) = None, np.zeros((2, len(tentative.points0)), bool)
         surely = False
         if self._asked != "homography":
             epipolar = propose(pair, tentative, "fundamental", self._seed)
@@ -184,7 +184,9 @@ class Explanation:
             assert layer.tracks is not None
             own, tracks = layer.hypothesis, layer.tracks.points
             self.best_nfa = min(self.best_nfa, own.log10_nfa)
-            if not layer.evidence.confirms:
+            if layer.evidence.is_chance:
+                chance |= own.inliers
+            elif not layer.evidence.confirms:
                 sparse.append(own)
             elif repeated:
                 refuted |= own.inliers
@@ -196,8 +198,10 @@ class Explanation:
         if epipolar is not None and flat is not None:
             least = 1 / 2 if flat.evidence.share >= NEARLY_ALL else MOST
             part = None if _mostly(flat.hypothesis.inliers, epipolar.inliers, least) else flat
-        if epipolar is not None and _mostly(refuted, epipolar.inliers, 1 / 2):
-            epipolar = None  # it explains the same pattern
+        if epipolar is not None and (
+            _mostly(refuted, epipolar.inliers, 1 / 2) or _mostly(chance, epipolar.inliers, 1 / 3)
+        ):
+            epipolar = None  # it explains the same pattern, or what is seen at the borders
         if epipolar is not None:
             epipolar = self._apart(pair, flats, epipolar)
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)

@@ -144,6 +144,12 @@ class Evidence:
         return self.windows >= MIN_WINDOWS and self.share >= MIN_SHARE
 
     @property
+    def is_chance(self) -> bool:
+        """Whether much is compared, and no more than twice as much explained as chance explains."""
+        compared = np.count_nonzero(np.isfinite(self.similarity)) / WINDOW_CELLS
+        return bool(compared > MIN_WINDOWS / MIN_SHARE and self.share < 2 * FALSE_POSITIVE_RATE)
+
+    @property
     def share(self) -> float:
         """Fraction of the compared cells that are explained."""
         known = np.count_nonzero(np.isfinite(self.similarity))
