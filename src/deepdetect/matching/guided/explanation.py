@@ -213,6 +213,8 @@ class Explanation:
             deep, sure = None, None if part is not None else flat
             if sure is None or _is_deep(sure, self._seed) or _is_doubtful(sure, epipolar):
                 deep = self._along_rows(pair, judge, epipolar, part or flat, free)
+                if deep and part and self._is_flat(deep, part):
+                    part = deep = None
             if deep is not None and (sure is None or _wins(deep, sure, self._seed)):
                 yield deep
             else:
@@ -227,6 +229,12 @@ class Explanation:
             few = self._sparse(best)
             if few is not None:
                 yield few
+
+    def _is_flat(self, deep: Layer, plane: Layer) -> bool:
+        """Return whether dense matches stay on a plane that is better founded than their depth."""
+        starts, own = deep.matches.starts(self.pixels[0]), plane.hypothesis
+        near = own.errors(starts, deep.matches.points1) < 2 * own.threshold_px
+        return own.log10_nfa < deep.hypothesis.log10_nfa and bool(near.mean() >= NEARLY_ALL)
 
     def _seen_plane(
         self,
