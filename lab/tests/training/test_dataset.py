@@ -196,16 +196,19 @@ def test_colors_change_and_labels_do_not(
     assert gray in grays
 
 
-def test_noise_of_a_sensor_changes_images_and_no_labels(source: FolderSource) -> None:
-    plain, noisy = (dataclasses.replace(OPTIONS, sensor_noise=share) for share in (0, 1))
+@pytest.mark.parametrize("dark", [0, 1])
+def test_noise_of_a_sensor_changes_dark_images_and_no_labels(
+    source: FolderSource, dark: int
+) -> None:
+    options = dataclasses.replace(OPTIONS, dark_fraction=dark)
+    plain, noisy = (dataclasses.replace(options, sensor_noise=share) for share in (0, 1))
     sigmas = []
     for (images, masks), (others, same_masks) in zip(
         batches(source, plain, last=8), batches(source, noisy, last=8), strict=True
     ):
         np.testing.assert_array_equal(masks, same_masks)
         sigmas += [np.std(b.astype(float) - a) for a, b in zip(images, others, strict=True)]
-    assert min(sigmas) > 0.3
-    assert 8 < max(sigmas) < 25
+    assert (max(sigmas) == 0) if not dark else (min(sigmas) > 0.3 and 4 < max(sigmas) < 25)
 
 
 def test_a_limit_of_the_memory_changes_nothing_but_the_time(source: FolderSource) -> None:

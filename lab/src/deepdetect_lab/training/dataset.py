@@ -173,10 +173,10 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
         mask = mask[top : top + side, left : left + side]
         if options.transpositions and generator.random() < 0.5:
             image, mask = transpose(image, mask)
+        dark = view.darkening is not None
         if generator.random() < options.color_jitter:
-            dark = view.darkening is not None
             image = jitter_color(image, generator, dark)
-        if generator.random() < options.sensor_noise:
+        if dark and generator.random() < options.sensor_noise:
             image = add_sensor_noise(image, generator)
         return torch.tensor(image), torch.tensor(mask)
 

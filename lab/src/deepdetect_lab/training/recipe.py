@@ -90,8 +90,8 @@ class TrainingOptions:
             mirrored crop differently. Flips would also change labels of Shi-Tomasi, SIFT and ORB.
         color_jitter: fraction of the crops whose colours are removed or rotated. The luma, on which
             labels and `fast` depend, changes by at most one grey level.
-        sensor_noise: fraction of the crops that get the noise of a sensor, while their labels are
-            those of the view without it.
+        sensor_noise: fraction of the dark crops that get the noise of a sensor, while their labels
+            are those of the view without it.
         optimizer: "adam", or "soap", which learns more per image (measurements: lab/HISTORY.md).
         learning_rate: learning rate at the start of cosine annealing, which ends at 1e-6.
         warm_up: fraction of the steps over which the learning rate rises from zero. It protects
