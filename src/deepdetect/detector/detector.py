@@ -35,8 +35,8 @@ from .heatmap import HeatmapOptions, compute_maps, memory_named
 from .pretrained import PRETRAINED, resolve_weights
 
 CHANNELS_OF_IMAGES = (
-    "give it with each image, as in detect(image, channels='bgr'); `network_channels` is the order "
-    "in the network's own input"
+    "give `channels` with each image, as in detect(image, channels='bgr'); `network_channels` is "
+    "the order in the network's own input"
 )
 
 

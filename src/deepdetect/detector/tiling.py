@@ -100,7 +100,7 @@ class TiledNetwork:
 
 
 def open_tiled(path: Path, threads: int | None = None) -> TiledNetwork | None:
-    """Return the network of an ONNX file, cut into parts; None if it is not the network `fast`."""
+    """Cut the network of an ONNX file into parts; return None if it is not the network `fast`."""
     state = path.stat()
     return _open(path.absolute(), threads, (state.st_mtime_ns, state.st_size))
 

@@ -97,7 +97,7 @@ def _parsed(content: bytes) -> Values:
     if values is None:
         values = _yaml(text)
     if isinstance(values, list) and any(isinstance(each, Mapping) for each in values):
-        values = dict(enumerate(values))  # "[section]" is a list of words
+        values = dict(enumerate(values))  # YAML reads "[section]" as a list
     values = values if isinstance(values, dict) else _text(lines)
     if not values and text[:1] != "{":
         raise ReconstructionError(f"it holds no cameras: {KNOWN}")

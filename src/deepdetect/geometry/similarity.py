@@ -26,9 +26,9 @@ MAX_START_TILT_DEG = 60.0
 this angle, because three points that lie nearly on a line can give any tilt."""
 
 MIN_AREA_POINTS, MIN_AREA, MUCH_BETTER = 8, 0.2, 0.5
-"""Points can overrule the known upward direction only if there are MIN_AREA_POINTS, their second
-principal axis is above MIN_AREA times as long as the first, and the median distance from the
-targets is below MUCH_BETTER of that with the upward direction. Chosen by hand."""
+"""The known upward direction is ignored only for MIN_AREA_POINTS or more points whose second
+principal axis is above MIN_AREA times as long as the first, and if the median residual is then
+below MUCH_BETTER times the one with the upward direction. Chosen by hand."""
 
 HUBER_STDS, WRONG_STDS = 2.0, 5.0
 """Residuals get less weight above HUBER_STDS sigmas, none above WRONG_STDS. Chosen by hand."""

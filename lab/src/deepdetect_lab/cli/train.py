@@ -1,4 +1,4 @@
-"""Commands for training: `train`, the other networks, `label`, `shards` and `average`."""
+"""Commands that train networks, label images, write shards and average weights."""
 
 from __future__ import annotations
 
@@ -269,7 +269,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """
     folder = cli.output_folder(output)
     how = SHARDS_RUN.take(values)
-    # Shards do not depend on the stages, so this stage stands for any: its crops fit every view.
+    # Shards do not depend on the stages: the crops of this one are small enough for any view.
     recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
     made = write_shards(images, folder, recipe, quiet=False, **how)
     return cli.Result(

@@ -26,9 +26,9 @@ from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
 
 SIDE_PX, MAX_SCALE_RATIO, MIN_SCALE = 1024, 1.5, 1 / 16
-"""Images are reduced to this longer side. If their scales differ by more than the first factor, the
-finer one is reduced further, because corners of different scales lie at different places; at most
-to the second. Lengths below are in pixels of the reduced images."""
+"""Images are reduced to a longer side of SIDE_PX. If their scales differ by more than
+MAX_SCALE_RATIO, the finer image is reduced further, at most to MIN_SCALE of its size, because
+corners of different scales lie at different places. Lengths below are in reduced pixels."""
 
 CORNERS, WINDOW_PX, CELL_PX = 1500, 21, 16
 """Maximum number of tracked corners, side of their windows, and of the squares from which one track
@@ -54,10 +54,10 @@ SAMPLES, MAX_ANGLE = 1000, 0.25
 agree: a third of the error of tracks for each pixel."""
 
 MIN_ALIGNED, MIN_SHARE, MIN_FAR_SHARE = 0.8, 0.08, 0.02
-"""A scene has depth if at least the first fraction of the places off the plane agrees with an
-epipole, and the second fraction of all places is off the plane and agrees. Something stands before
-the plane if the first fraction of what is off by more than `FAR` times the noise agrees, and the
-third fraction of all places is so. By chance, 0.16 of the places agree."""
+"""A scene has depth if at least MIN_ALIGNED of the tracks off the plane agree with one epipole, and
+these are MIN_SHARE of all tracks. Something stands before the plane if the same holds, with
+MIN_FAR_SHARE, of the tracks that are off it by more than FAR times the noise. By chance, 0.16 of
+the tracks agree with the best epipole."""
 
 FAR = 3.0
 

@@ -26,7 +26,7 @@ from .judge import Evidence, Judge
 from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
 
 MIN_MATCHED_FRACTION = 0.02
-"""Dense matching has failed if it matches less than this fraction of the keypoints."""
+"""Dense matching has failed if it matches less than this fraction of the fewer keypoints."""
 
 MOST = 2 / 3
 """A scene has depth if a homography explains less than this fraction of the matches that agree with
@@ -51,19 +51,19 @@ MIN_GAIN = 1.05
 matches of the rest as the matrix of all, and less than a third of those on the plane."""
 
 MAX_STILL = 0.005
-"""Motions of less than this fraction of the longer side may be errors: 3 pixels of 640, the inlier
-threshold of a homography."""
+"""A homography that moves the corners by less than this fraction of the longer side stands still:
+3 pixels of 640 are its inlier threshold."""
 
 MIN_MOVING = 0.5
-"""What stands still is left out if a geometry that moves explains at least this fraction of as many
-windows: a caption, a part of the vehicle. With less, something moves before a still camera."""
+"""What stands still (a caption, a part of the vehicle) is left out if a moving geometry explains at
+least this many times as many windows. With less, something moves before a still camera."""
 
 MAX_LAYERS = 4
 """Maximum number of geometries of one pair: one of the scene, others of what moves on its own."""
 
 HIGH_SHARE, HIGH_LOG10_NFA = 0.2, -12.0
-"""The confidence is "high" only if the images confirm at least this fraction of the compared
-windows, and the log10 number of false alarms is below the second value."""
+"""The confidence is "high" only if the images confirm at least HIGH_SHARE of the compared cells and
+the log10 number of false alarms of the sparse matches is below HIGH_LOG10_NFA."""
 
 SCENE_MATCHES, DOMINANT_FRACTION = 1000, 0.5
 """A plane is dominant if DOMINANT_FRACTION of SCENE_MATCHES random dense matches or more lie on it,

@@ -48,26 +48,26 @@ DIMENSIONS = 64
 correlations by less than noise and takes a quarter of the time."""
 
 FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
-"""A cell is explained if fewer than the first fraction of the cells of displaced copies correlate
-as well. It is contradicted if its surroundings do not pass the second: doubting one cell
-needs less evidence than believing it."""
+"""A cell is explained if less than FALSE_POSITIVE_RATE of the cells of displaced copies correlate
+as well. It is contradicted if its surroundings correlate no better than CONTRADICTING_RATE of theirs:
+doubting one cell needs less evidence than believing it."""
 
 FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
-"""Copies displaced by these fractions of width and height, in both directions, show what chance
-looks like on this pair."""
+"""The second image shifted by plus or minus these fractions of its width and height gives the
+correlations that occur by chance in this pair."""
 
 MIN_PERIOD = 3
 """Displacements of fewer cells are no copies, because descriptors of aligned images overlap."""
 
 MIN_SIMILARITY, MAX_COPIES, MIN_OVERLAP = 0.4, 4, 0.5
 """A displaced copy is compared with a geometry if its correlation over the whole image is at least
-the first fraction of the geometry's, and this fraction of the overlap remains. Planes of Oxford
-have copies of up to 0.3, facades of one repeated window 0.6 or more. A lattice has four nearest
-copies."""
+MIN_SIMILARITY times the geometry's, and MIN_OVERLAP of the overlap remains. Planes of Oxford have
+copies of up to 0.3, facades of one repeated window 0.6 or more. A lattice has MAX_COPIES
+nearest copies."""
 
 MIN_WON, MIN_WON_RATIO = 0.0125, 1.5
-"""A geometry must explain at least the first fraction of its cells clearly better than a copy does,
-and the second value times as many as the copy explains better. On facades with one window that is
+"""A geometry must explain at least MIN_WON of its cells clearly better than a displaced copy does,
+and MIN_WON_RATIO times as many as the copy explains better. On facades with one window that is
 unlike the others, the fraction is 0.03 or more, on a truss 0.017; if all windows are alike, up
 to 0.012 for some copy, and 0.002 without the frames of the images."""
 
@@ -76,13 +76,13 @@ MIN_TIED = 0.5
 that explains only the road of a street competes with nothing."""
 
 MIN_STRUCTURE, MIN_GRADIENT = 0.5, 4.0
-"""What has a mean difference of pixels two apart, in grey levels, below the first value in both
-images is flat and not compared. What has more than the second value in both shows more than noise:
+"""Limits of the mean difference of pixels two apart, in grey levels. What is below MIN_STRUCTURE in
+both images is flat and not compared. What is above MIN_GRADIENT in both shows more than noise:
 noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
 
 MIN_WINDOWS, MIN_SHARE = 8.0, 0.1
-"""The images confirm a geometry if it explains at least this number of windows, and this fraction
-of what can be compared. Geometries of unrelated photographs explain up to 0.07 of them, correct
+"""The images confirm a geometry if it explains at least MIN_WINDOWS windows, and MIN_SHARE of the
+cells that can be compared. Geometries of unrelated photographs explain up to 0.07 of them, correct
 ones of long strips in other light 8 windows or more."""
 
 
@@ -171,7 +171,7 @@ class Judge:
 
     @cached_property
     def _described(self) -> tuple[np.ndarray, np.ndarray]:
-        """The principal axes, and the described cells of the first image, (rows, columns, D)."""
+        """PCA axes of the first image's descriptors, and these reduced, (rows, columns, D)."""
         cells, shape = describe(self._first)
         axes = np.linalg.eigh(cells.T @ cells)[1][:, -DIMENSIONS:]
         return axes, (cells @ axes).reshape(*shape, DIMENSIONS)

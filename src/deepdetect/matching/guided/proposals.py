@@ -31,8 +31,8 @@ LEARNED_SIDE_PX, LEARNED_KEYPOINTS = 640, 2048
 They give a geometry for all pairs of Oxford but bark 1-6, and for half of the other hard ones."""
 
 DENSE_SIDE_PX, DENSE_KEYPOINTS = 1280, 8192
-"""A later source uses larger images and more points, because that finds twice as many correct
-matches where few are correct."""
+"""The second source uses larger images and more points than the first, which finds twice as many
+correct matches where few are correct."""
 
 GIVEN_SIDE_PX = 1200
 """Positions of the caller are taken to be as exact as in images of this longer side."""
