@@ -49,7 +49,7 @@ correlations by less than noise and takes a quarter of the time."""
 
 FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
 """A cell is explained if less than FALSE_POSITIVE_RATE of the cells of displaced copies correlate
-as well. It is contradicted if its surroundings correlate no better than CONTRADICTING_RATE of theirs:
+as well, and contradicted if its surroundings correlate no better than CONTRADICTING_RATE of theirs:
 doubting one cell needs less evidence than believing it."""
 
 FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
