@@ -139,7 +139,7 @@ def command(
 ) -> Callable[[Callable[..., Result | None]], Callable[..., int]]:
     """Turn a function into a command, which prints its result and has the option --json.
 
-    Options of `sources` that the user sets are passed to the function as `**values`.
+    Parameters in `sources` become options; those set are passed as `**values`.
     """
 
     def decorate(function: Callable[..., Result | None]) -> Callable[..., int]:

@@ -205,7 +205,7 @@ def check_pinhole(values: Values) -> None:
 
 
 def _pair_at(values: Values, choices: Iterable[tuple[str, ...]]) -> list[float]:
-    """Return the two numbers under the first names found, or none; a single number is repeated."""
+    """Return both values of the first choice of keys in `values`, or []; repeat a single value."""
     for names in choices:
         if numbers := [n for name in names for n in numbers_in(values.get(name))]:
             if len(numbers) < len(names):

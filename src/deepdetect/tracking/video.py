@@ -194,7 +194,7 @@ def _check_decoded(path: Path) -> None:
     if len({*frames}) > 1:
         return
     text = f"the first {len(frames)} frames of {path} are equal"
-    # An encoder skips an unchanged block of 16x16 pixels by a bit; headers take up to 100 bytes.
+    # An encoder spends one bit on an unchanged block of 16x16 pixels; headers, up to 100 bytes.
     unchanged = frames[0][1] / 3 / 16**2 / 8 + 100
     differ = packets and len({*packets}) == len(packets)
     if differ and np.median([size for _, size in packets]) > unchanged:

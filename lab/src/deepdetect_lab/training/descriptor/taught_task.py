@@ -61,10 +61,10 @@ class TaughtTrainer(DescriptorTrainer):
         "and is taught by EdgePoint2-E64 (MIT, HITCSC-Robotics) and ALIKED-n16rot (BSD-3-Clause)"
     )
     measures = (
-        "Share of the keypoints whose match, a mutual nearest neighbour, is correct within 3 px, "
-        "for each kind of pairs of views of the validation images; mean cosine to the whitened "
-        "codes of both teachers, share of the points whose predicted code is nearest to their own; "
-        "correlation of scores with those of ALIKED; the score is the mean of the first five"
+        "Share of keypoints whose mutual nearest neighbour is correct within 3 px, for the three "
+        "kinds of pairs of views of the validation images; mean cosine of predicted codes to the "
+        "whitened codes of both teachers; share of points whose predicted code is nearest to their "
+        "own; correlation of scores with those of ALIKED; the score is the mean of the first five"
     )
     kind_of_network = EdgeNetwork
     no_kernels = ("at_half", "by_size", "score")
