@@ -68,7 +68,7 @@ def methods(files: list[str]) -> dict[str, Extract]:
     """Return the functions that extract keypoints with descriptors, by name of the method."""
     found: dict[str, Extract] = {
         kind: PointDetector(KEYPOINTS, descriptor=kind).extract
-        for kind in ("rootsift", "learned", "learned-free", "cross-modal")
+        for kind in ("rootsift", "learned", "learned-free")
     }
     others = {Path(file).stem: _extract_other(file) for file in files}
     return found | {"SIFT": _extract_sift} | others

@@ -18,17 +18,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from descriptors import methods
+from descriptors import KEYPOINTS, methods
 from scipy.io import loadmat
 
-from deepdetect import DeepDetect, Matches, match_features, match_images
+from deepdetect import (
+    DeepDetect,
+    ImageError,
+    Matches,
+    PointDetector,
+    match_features,
+    match_images,
+)
 from deepdetect.geometry.transforms import transfer_errors, transform_points, translation_matrix
 from deepdetect_lab.evaluation.report import Row, Table
 
 RIGHT_PX, LANDMARK_ERRORS = 5.0, 3.0
 """Limits of correct matches: in pixels, and in errors of landmarks. Chosen by hand."""
-
-OWN = "learned", "cross-modal"
 
 
 class ModalPair:
@@ -63,13 +68,18 @@ def to_bytes(image: np.ndarray) -> np.ndarray:
 
 def measure(paths: Sequence[Path], files: Sequence[str]) -> Row:
     """Return the columns of the table for pairs of one kind."""
-    others = {Path(file).stem for file in files}
-    extractors = {n: e for n, e in methods([*files]).items() if n in {*OWN, *others}}
+    known, others = methods([*files]), [Path(file).stem for file in files]
+    edges = PointDetector(KEYPOINTS, descriptor="cross-modal").extract
+    extractors = {"learned": known["learned"], "cross-modal": edges}
+    extractors |= {name: known[name] for name in others}
     detector, answers, right = DeepDetect(), [], dict.fromkeys(extractors, 0)
     for pair in map(ModalPair, paths):
-        matches = match_images(*pair.images, detector)
-        good = 2 * pair.right(matches) >= len(matches)
-        answers.append((len(matches) > 0, matches.geometry.confidence == "high", good))
+        try:
+            matches = match_images(*pair.images, detector)
+            good = 2 * pair.right(matches) >= len(matches)
+            answers.append((len(matches) > 0, matches.geometry.confidence == "high", good))
+        except ImageError:  # a round picture of a retina looks like one of a fisheye
+            answers.append((False, False, False))
         for name, extract in extractors.items():
             first, second = (extract(image) for image in pair.images)
             right[name] += pair.right(match_features(first, second, ratio=1))

@@ -437,10 +437,9 @@ def _is_doubtful(flat: Layer, epipolar: Hypothesis) -> bool:
 
 
 def _wins(deep: Layer, flat: Layer, seed: int) -> bool:
-    """Return whether a scene has depth: by parallax, or because the plane explains less of it."""
-    if deep.evidence.windows < flat.evidence.windows / 2:
-        return False
-    return _is_deep(flat, seed) or deep.evidence.share > flat.evidence.share
+    """Return whether a scene has depth: by parallax, or because depth explains more of it."""
+    windows = flat.evidence.windows / 2 if _is_deep(flat, seed) else flat.evidence.windows
+    return deep.evidence.windows >= windows
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
