@@ -48,13 +48,13 @@ DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """Options for matching rows. The range of disparities is set for each pair."""
 
 MAX_PIXELS, MAX_VOLUME = 1e6, 1.2e7
-"""Frames are made with at most this many pixels. Their disparities are searched in copies that are
-scaled down if pixels times disparities exceed the second value, to bound time and memory; then they
-are refined in the frames themselves."""
+"""Frames have at most MAX_PIXELS pixels. Their disparities are searched in copies that are scaled
+down if pixels times disparities exceed MAX_VOLUME, to bound time and memory; then they are refined
+in the frames themselves."""
 
 MAX_STEP_PX = 4.0
-"""If disparities are searched in steps of more than this, what is near a plane may be matched in
-finer ones, which can be more."""
+"""If the whole range of disparities is searched in wider steps, the range near the plane is also
+searched alone, in finer steps; the result with more matches is kept."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """The range of disparities is extended at both ends by this many pixels plus this fraction of its
