@@ -233,7 +233,7 @@ class Explanation:
     def _is_flat(self, deep: Layer, plane: Layer) -> bool:
         """Return whether dense matches stay on a plane that is better founded than their depth."""
         starts, own = deep.matches.starts(self.pixels[0]), plane.hypothesis
-        near = own.errors(starts, deep.matches.points1) < 2 * own.threshold_px
+        near = own.errors(starts, deep.matches.points1) < own.threshold_px
         return own.log10_nfa < deep.hypothesis.log10_nfa and bool(near.mean() >= NEARLY_ALL)
 
     def _seen_plane(
