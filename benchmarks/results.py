@@ -356,10 +356,12 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
     if "benchmark" in words:
         subprocess.run([sys.executable, *words], check=True)
         return
-    made = subprocess.run([sys.executable, *words], check=True, stdout=subprocess.PIPE, text=True)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "printed.txt").write_text(made.stdout)  # saves hours of work if parsing fails
-    found = [evaluated(made.stdout)] if "--json" in words else printed_tables(made.stdout)
+    printed = folder / "printed.txt"  # saves hours of work if the stage or the parsing fails
+    with printed.open("w") as stdout:
+        subprocess.run([sys.executable, *words], check=True, stdout=stdout)
+    text = printed.read_text()
+    found = [evaluated(text)] if "--json" in words else printed_tables(text)
     tables = {str(k): {"rows": rows} for k, rows in enumerate(found)}
     (folder / "report.json").write_text(json.dumps({"metadata": {}, "tables": tables}))
 

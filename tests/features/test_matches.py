@@ -71,6 +71,12 @@ def test_indices_that_do_not_fit_are_an_error(indices: Any) -> None:
         matches_of([5, 6, 7, 8], [1, 2, 3, 4], indices0=np.array(indices))
 
 
+@pytest.mark.parametrize("layer", [[0, 0, 1], [[0, 1], 0, 1, 2], [[0], [0], [0], [0]]])
+def test_layers_that_do_not_fit_are_an_error(layer: Any) -> None:
+    with pytest.raises(OptionError, match="layer"):
+        matches_of([5, 6, 7, 8], [1, 2, 3, 4], layer=layer)
+
+
 def test_indices_are_looked_up_where_none_are_given() -> None:
     rng = np.random.default_rng(0)
     rows = rng.permutation(len(GRID))[:50]
@@ -106,6 +112,9 @@ def test_a_geometry_is_judged_by_the_matches_that_agree() -> None:
         assert (told.evidence.log10_nfa < MAX_LOG10_NFA) is trusted
         np.testing.assert_array_equal(judged.inliers, inliers & trusted)
         np.testing.assert_array_equal(judged.points0, bare.points0)
+    for wrong in (0, -1, np.nan, "near"):
+        with pytest.raises(OptionError, match="`inlier_threshold`"):
+            bare.with_geometry(Geometry("homography", np.eye(3), inliers), wrong)  # type: ignore[arg-type]
     # What could not be estimated is no geometry either.
     nothing = bare.with_geometry(Geometry("fundamental", None, np.zeros(40, bool)))
     assert (nothing.geometry.model, nothing.success, len(nothing)) == ("none", False, 40)

@@ -11,7 +11,7 @@ import pytest
 from natsort import natsorted, ns
 from PIL import Image, ImageOps
 
-from deepdetect._shared.errors import ImageError
+from deepdetect._shared.errors import ImageError, OptionError
 from deepdetect.io.image import find_images, load_image, luma
 from deepdetect.io.image_file import IMAGE_SUFFIXES
 
@@ -227,6 +227,8 @@ BAD_ARRAYS = {
     "below 0": with_value(-0.01),
     "int64": np.zeros((20, 20), np.int64),
     "words": np.full((20, 20), "a"),
+    "empty": np.zeros((0, 20), np.uint8),
+    "empty with alpha": np.zeros((0, 20, 4), np.uint16),
     "nothing": None,
     "a number": 5,
 }
@@ -236,6 +238,13 @@ BAD_ARRAYS = {
 def test_bad_arrays(kind: str) -> None:
     with pytest.raises(ImageError):
         load_image(BAD_ARRAYS[kind])
+
+
+@pytest.mark.parametrize("name", ["value_range", "bands"])
+def test_tables_in_place_of_numbers_are_refused(name: str) -> None:
+    for table in (np.ones((2, 2)), np.ones((3, 2, 2)), [[1, 2], 3]):
+        with pytest.raises(OptionError, match=f"`{name}`"):
+            load_image(np.zeros((20, 20), np.uint8), **{name: table})
 
 
 @pytest.mark.parametrize("bits", [12, 16])

@@ -90,7 +90,7 @@ def array_to_pixels(
         return rgb
     alpha = array[:, :, 3]
     # In a deep image, the largest alpha counts as opaque, since 12-bit values end at 4095.
-    opaque = 255 if array.dtype == np.uint8 else max(alpha.max(), 1)
+    opaque = 255 if array.dtype == np.uint8 else alpha.max(initial=1)
     return on_grey(rgb, alpha, opaque, name)
 
 

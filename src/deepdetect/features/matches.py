@@ -12,7 +12,7 @@ from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import numbers_of, suggest_keywords, whole
-from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
+from ..geometry.estimation import MAX_LOG10_NFA, Geometry, GeometryOptions, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
@@ -270,7 +270,9 @@ class Matches:
                     f"[{indices.min()}, {indices.max()}]"
                 )
             object.__setattr__(self, name, indices.astype(np.int32))
-        layer = np.full(len(self), -1) if self.layer is None else np.asarray(self.layer)
+        layer = (
+            np.full(len(self), -1) if self.layer is None else numbers_of("layer", self.layer, None)
+        )
         if layer.shape != (len(self),):
             raise OptionError(f"matches need one number per match in layer, not {layer.shape}")
         object.__setattr__(self, "layer", layer.astype(np.int8))
@@ -304,6 +306,7 @@ class Matches:
             found: the geometry that was estimated from these matches.
             inlier_threshold: the threshold, in pixels, with which the geometry was estimated.
         """
+        GeometryOptions(inlier_threshold=inlier_threshold)
         alarms = np.inf
         if found.matrix is not None:
             size = self.keypoints1.image_size

@@ -30,6 +30,9 @@ ignores the inlier threshold if there are fewer."""
 MAX_LOG10_NFA = -6.0
 """A geometry is trusted if log10 of its number of false alarms is below this. Chosen by hand."""
 
+NEARBY_AREA = 16.0
+"""The matches near a model are those in this many times the area in which they agree with it."""
+
 MAX_ORDERS = 100
 """Matches are tried in at most this number of orders. OpenCV 5.0 raised an error for 20 of 1,600
 sets of 15 to 25 matches in a small region, and for the worst of these sets in 89 of 100 orders."""
@@ -325,6 +328,22 @@ def log10_nfa(
     agreeing = int(np.count_nonzero(inliers))
     sample_size = MINIMAL_SAMPLE_SIZE[model]
     return _log10_nfa(len(inliers), agreeing, sample_size, chance, models_per_sample)
+
+
+def log10_nfa_nearby(errors: np.ndarray, model: str, inlier_threshold: float) -> float:
+    """Return the log10 NFA of a model among the matches near it, of which (M,) errors are given.
+
+    Matches that are wrong by some pixels, as of the vague shapes in images of two sensors, crowd
+    around the true geometry, and more of them agree with some warped one than of matches that end
+    anywhere. So the model must gather matches from `NEARBY_AREA` times the area in which they agree
+    with it.
+    """
+    reach = NEARBY_AREA**0.5 if model == "homography" else NEARBY_AREA
+    count, agreeing = (
+        int(np.count_nonzero(errors < limit))
+        for limit in (reach * inlier_threshold, inlier_threshold)
+    )
+    return _log10_nfa(count, agreeing, MINIMAL_SAMPLE_SIZE[model], 1 / NEARBY_AREA)
 
 
 def _log10_nfa(

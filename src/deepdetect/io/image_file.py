@@ -139,8 +139,9 @@ class ReadingOptions:
             value = getattr(self, name)
             numbers: tuple[Any, ...] = tuple(value) if np.iterable(value) else ()
             fits = len(numbers) == count and all(isinstance(each, kind) for each in numbers)
-            least = numbers[1] - numbers[0] if fits and count == 2 else min(numbers, default=0)
-            if value is not None and not (fits and 0 < least < math.inf):
+            if fits:
+                fits = 0 < (min(numbers) if count == 3 else numbers[1] - numbers[0]) < math.inf
+            if value is not None and not fits:
                 raise OptionError(f"`{name}` must be {what}, not {shown(value)}")
             object.__setattr__(self, name, numbers or None)
 
