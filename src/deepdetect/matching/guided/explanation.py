@@ -41,7 +41,7 @@ explains less may leave out something that stands before it."""
 MAX_NEARBY_LOG10_NFA = -3.0
 """Without dense matches, sparse ones are an answer if the log10 number of false alarms of those
 that move is below HIGH_LOG10_NFA, and below this among the matches nearby. Those that stand still
-may come from the borders, which descriptors see, or from a frame. Of 40 sparse answers, wrong ones
+may come from the borders, which descriptors see, or from a frame. Wrong ones of 40 sparse answers
 reach -2.3 among the matches nearby."""
 
 OFF_RATIO = 4.0
