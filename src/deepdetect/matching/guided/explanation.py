@@ -139,8 +139,6 @@ class Explanation:
             further = next(self._confirmed(tentative.chosen(free), ~explained), None)
             if further is None or not further.dense:
                 break
-            if further.hypothesis.log10_nfa >= HIGH_LOG10_NFA:
-                break
             layers.append(further)
             explained = explained | further.evidence.explained
         layers.sort(key=lambda layer: -layer.evidence.windows)
@@ -171,13 +169,15 @@ class Explanation:
         """Yield layers that the images confirm, the best first, then sparse ones."""
         pair, judge = self._seen(tentative.cross_modal)
         epipolar, (refuted, chance) = None, np.zeros((2, len(tentative.points0)), bool)
-        surely = False
+        surely, least = False, np.inf if free is None else HIGH_LOG10_NFA
         if self._asked != "homography":
             epipolar = propose(pair, tentative, "fundamental", self._seed)
         sparse: list[Hypothesis] = []
         flats: list[Hypothesis] = []
         if self._asked != "fundamental":
             flats = [*planes(pair, tentative, self._seed)]
+        epipolar = None if epipolar is None or epipolar.log10_nfa >= least else epipolar
+        flats = [each for each in flats if each.log10_nfa < least]
         seen = (self._seen_plane(pair, judge, plane, epipolar, free) for plane in flats)
         flat: Layer | None = None
         tracks: Pair | None = None
