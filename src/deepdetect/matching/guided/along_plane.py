@@ -35,7 +35,7 @@ CORNERS, WINDOW_PX, CELL_PX = 1500, 21, 16
 each shows parallax."""
 
 MIN_TRACKS, SQUARES = 15, 8
-"""A homography is fitted to at least this number of tracks. The chessboard has this many squares
+"""A geometry is fitted to at least this number of tracks. The chessboard has this many squares
 along the longer side."""
 
 MAX_PARALLAX = 0.1

@@ -41,7 +41,7 @@ from ..stereo.matching import (
     range_with_margin,
 )
 from ..stereo.sgm import MAX_DIFFERENCE_PX, DisparityRange, refine_disparity
-from .along_plane import MAX_PARALLAX
+from .along_plane import CORNERS, MAX_PARALLAX, MIN_TRACKS, WINDOW_PX
 from .image_pair import Pair
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
@@ -62,12 +62,6 @@ length. Chosen on Oxford and others."""
 
 CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
 """Side of the windows in which rectified views are correlated, and sigma of the preceding blur."""
-
-TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
-"""Maximum number of tracked corners, and side of their windows. Chosen on Oxford and others."""
-
-MIN_TRACKS = 50
-"""A pair with fewer tracked corners gets no dense matches. Chosen on Oxford and others."""
 
 MAX_DISAGREEMENT_PX = 3.0
 """A sparse match agrees with the disparity at its start if its own differs by less than this. The
@@ -273,16 +267,14 @@ def _track(view: RectifiedView) -> Pair | None:
     """
     first, second = (equalise(gray) for gray in view.views)
     mask = np.isfinite(view.disparity).astype(np.uint8)
-    corners = cv2.goodFeaturesToTrack(first, TRACKED_CORNERS, 0.001, 5, mask=mask)
+    corners = cv2.goodFeaturesToTrack(first, CORNERS, 0.001, 5, mask=mask)
     if corners is None or len(corners) < MIN_TRACKS:
         return None
     start = corners.reshape(-1, 2)
     column, row = np.rint(start).astype(np.int64).T
     disparity = view.disparity[row, column]
     expected = start - np.column_stack([disparity, np.zeros(len(start))]).astype(np.float32)
-    ends, gaps = track_round_trip(
-        first, second, start, TRACKED_WINDOW_PX, levels=1, expected=expected
-    )
+    ends, gaps = track_round_trip(first, second, start, WINDOW_PX, levels=1, expected=expected)
     good = gaps < MAX_ROUND_TRIP_PX
     if np.count_nonzero(good) < MIN_TRACKS:
         return None
