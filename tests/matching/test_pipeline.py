@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -358,3 +359,23 @@ def test_images_of_opencv_are_matched_as_what_they_show(photo: np.ndarray) -> No
     np.testing.assert_array_equal(found.keypoints1.scores, expected.keypoints1.scores)
     with pytest.raises(OptionError, match="'brg'"):
         match(*bgr, channels="brg")
+
+
+def test_a_logo_on_transparent_ground_is_found(shared: Path) -> None:
+    """Its strokes are too thin for windows, so that the sparse matches decide alone."""
+    case = shared / "cases" / "transparent-logo"
+    expected = match(case / "logo-on-white.png", case / "photo.png").geometry.matrix
+    found = match(case / "logo.png", case / "photo.png")
+    assert found.geometry.confidence == "fair"
+    assert len(found) > 5000
+    assert (transfer_errors(found.points0, found.points1, expected) < 2).mean() > 0.98
+
+
+def test_confidence_is_fair_if_more_stands_still_than_moves(shared: Path) -> None:
+    case = shared / "cases" / "static-overlay"
+    with pytest.warns(UserWarning, match="stands still"):
+        found = match(case / "frame0.png", case / "frame1.png")
+    assert found.geometry.evidence.left_out > 0.5
+    assert found.geometry.confidence == "fair"
+    moved = np.linalg.norm(found.points1 - found.points0, axis=1)
+    assert moved.min() > 1

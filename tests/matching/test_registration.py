@@ -155,6 +155,14 @@ def test_flat_drawings_are_judged_by_their_structure(kind: str) -> None:
     assert corner_error(found.homography, moved, (480, 480)) < 1.5
 
 
+def test_a_board_whose_lines_repeat_is_registered(shared: Path) -> None:
+    """A copy that is displaced by a line is as similar; most points still find their own."""
+    board = shared / "cases" / "register-bare-board"
+    found = register(board / "template.png", board / "test.png")
+    assert corner_error(found.homography, np.eye(3), (480, 480)) < 2
+    assert found.zncc > 0.9
+
+
 def test_a_negative_is_registered_to_its_print(photo: np.ndarray, second: np.ndarray) -> None:
     found = register(photo, 255 - second)
     assert corner_error(found.homography, WARP, (256, 256)) < 1

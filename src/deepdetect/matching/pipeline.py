@@ -223,10 +223,13 @@ def match_features(
 
 
 def _noted(matches: Matches, left_out: float) -> Matches:
-    if not left_out or (geometry := matches.geometry) is None:
+    """Add the share that is left out. If it is the larger part, the scene is a guess."""
+    if (geometry := matches.geometry) is None:
         return matches
     evidence = replace(geometry.evidence, left_out=left_out + geometry.evidence.left_out)
-    return replace(matches, geometry=replace(geometry, evidence=evidence))
+    unsure = geometry.confidence == "high" and evidence.left_out > 1 / 2
+    confidence = "fair" if unsure else geometry.confidence
+    return replace(matches, geometry=replace(geometry, evidence=evidence, confidence=confidence))
 
 
 def _match_guided(

@@ -113,10 +113,21 @@ class Evidence:
 
     @cached_property
     def believed(self) -> np.ndarray:
-        """(rows, columns) bool, where matches are believed: at the border, as next to it."""
+        """(rows, columns) bool, where matches are believed: at the border, as next to it.
+
+        If too little is compared, they are believed everywhere, as their geometry is.
+        """
+        if not self.compares:
+            return np.ones(self.similarity.shape, bool)
         side = 2 * (MARGIN_PX // CELL_PX + 1) + 1
         near = cv2.dilate(self.explained.astype(np.uint8), np.ones((side, side))) > 0
         return np.where(np.isfinite(self.similarity), self.explained, near)
+
+    @property
+    def compares(self) -> bool:
+        """Whether enough is compared to believe the geometry or to doubt it."""
+        compared = np.count_nonzero(np.isfinite(self.similarity))
+        return bool(compared >= MIN_WINDOWS * WINDOW_CELLS)
 
     @property
     def windows(self) -> float:
