@@ -223,12 +223,13 @@ class Explanation:
         if flat is not None and len(flat.matches) < self._enough:
             flat = None
         if epipolar is not None:
-            deep, sure = None, None if part is not None else flat
-            if sure is None or _is_deep(sure, self._seed) or _is_doubtful(sure, epipolar):
-                deep = self._along_rows(pair, judge, epipolar, part or flat, free)
+            deep, best = None, part or flat
+            seen = part is not None or flat is None or _is_deep(flat, self._seed)
+            if seen or (flat is not None and _is_doubtful(flat, epipolar)):
+                deep = self._along_rows(pair, judge, epipolar, best, free)
                 if deep and part and self._is_flat(deep, part):
                     part = deep = None
-            if deep is not None and (sure is None or _wins(deep, sure, self._seed)):
+            if deep is not None and (best is None or _wins(deep, best, seen)):
                 yield deep
             else:
                 sparse.append(self._sparse(epipolar))
@@ -464,10 +465,9 @@ def _copies(plane: Layer, other: Layer) -> bool:
     return bool(fewer and np.count_nonzero(both) >= least)
 
 
-def _wins(deep: Layer, flat: Layer, seed: int) -> bool:
-    """Return whether a scene has depth: by parallax, or because depth explains more of it."""
-    windows = flat.evidence.windows / 2 if _is_deep(flat, seed) else flat.evidence.windows
-    return deep.evidence.windows >= windows
+def _wins(deep: Layer, flat: Layer, seen: bool) -> bool:
+    """Return whether depth explains as much as a plane; half of it, if depth is `seen`."""
+    return deep.evidence.windows >= flat.evidence.windows / (2 if seen else 1)
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
