@@ -216,6 +216,18 @@ def test_a_dominant_plane_does_not_hide_the_depth_beside_it(
 
 
 @pytest.mark.slow
+def test_depth_explains_as_much_as_a_plane_that_is_a_part_of_it(shared: Path) -> None:
+    """Few matches off both planes of this pair fit to a matrix by which it explains less."""
+    (scene,) = load_posed_scenes(shared / "data" / "entry")
+    first, second = scene.images[0], scene.images[5]
+    matches = match(first.path, second.path)
+    pair = PosedPair("entry", first, second)
+    errors = epipolar_errors(matches.points0, matches.points1, pair.fundamental)
+    assert len(matches) > 100_000
+    assert (errors < 3).mean() > 0.99
+
+
+@pytest.mark.slow
 def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> None:
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
     detector = DeepDetect("dense")
