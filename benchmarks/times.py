@@ -150,7 +150,7 @@ def main() -> None:
     pairs = {pair.name: pair for pair in pairs_of(load_oxford(oxford, "refined"))}
     run = Run(oxford, arguments.cache)
     features = [*classical(), *networks(arguments.method, "openvino", None)]
-    measured = run.rows("", features, pairs, lambda *of: pair_row(run, *of, (MATCHING_BUDGET,)))
+    measured = run.rows("", features, pairs, partial(pair_row, run))
     photograph = oxford / "graf" / "img1.png"
     times = {n: on_processors(n, measure_times, photograph, arguments.method) for n in (1, 2)}
     rows = []
