@@ -44,6 +44,10 @@ that move is below HIGH_LOG10_NFA, and below this among the matches nearby. Thos
 may come from the borders, which descriptors see, or from a frame. Wrong ones of 40 sparse answers
 reach -2.3 among the matches nearby."""
 
+MIN_KEPT = 0.8
+"""Depth explains nearly all of what a plane does if it explains this fraction. Correct depth
+explains 0.86 or more, that of wrong fundamental matrices of entry up to 0.72."""
+
 OFF_RATIO = 4.0
 """Tentative matches with errors above this multiple of the inlier threshold are not explained."""
 
@@ -128,13 +132,14 @@ class Explanation:
             found = next(self._confirmed(tentative), None)
             if self.refuted:
                 return []
-            if found is not None and found.confirmed:
+            if found is None or (
+                fallback is not None and found.hypothesis.log10_nfa > fallback.hypothesis.log10_nfa
+            ):
+                continue  # what explains more is better, also without the images
+            if found.confirmed:
                 layers.append(found)
                 break
-            if found is not None and (
-                fallback is None or found.hypothesis.log10_nfa < fallback.hypothesis.log10_nfa
-            ):
-                fallback = found
+            fallback = found
         if not layers:
             return [] if fallback is None else [fallback]
         free = np.ones(len(tentative.points0), bool)
@@ -466,8 +471,16 @@ def _copies(plane: Layer, other: Layer) -> bool:
 
 
 def _wins(deep: Layer, flat: Layer, seen: bool) -> bool:
-    """Return whether depth explains as much as a plane; half of it, if depth is `seen`."""
-    return deep.evidence.windows >= flat.evidence.windows / (2 if seen else 1)
+    """Return whether depth explains as much as a plane; if depth is `seen`, half of it.
+
+    Dense matches may be few: it is enough, too, if depth explains nearly all of what the plane
+    does, where it compares the images.
+    """
+    if not seen:
+        return deep.evidence.windows >= flat.evidence.windows
+    compared = flat.evidence.explained & np.isfinite(deep.evidence.similarity)
+    kept = _mostly(compared & deep.evidence.explained, compared, MIN_KEPT)
+    return kept or deep.evidence.windows >= flat.evidence.windows / 2
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
