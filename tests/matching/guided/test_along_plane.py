@@ -163,8 +163,7 @@ def cones(shared: Path) -> PlaneTracks:
 
 
 def test_a_scene_with_depth_shows_it_relative_to_its_largest_plane(cones: PlaneTracks) -> None:
-    assert cones.parallax().shows_depth
-    assert cones.parallax().share > 0.3
+    assert cones.show_depth()
 
 
 @pytest.mark.parametrize("off_px", [0.0, 3.0])
@@ -174,8 +173,7 @@ def test_a_plane_shows_no_depth(warped_pair: ImagePair, off_px: float) -> None:
     rng = np.random.default_rng(0)
     ends = matches.points1 + rng.normal(0, off_px, matches.points1.shape)
     found = PlaneTracks(warped_pair, WARP, (matches.points0, ends))
-    assert not found.parallax().shows_depth
-    assert not found.parallax().shows_foreground
+    assert not found.show_depth(foreground=True)
     corners = np.array([[20.0, 20], [230, 20], [20, 230], [230, 230]])
     ends = transform_points(corners, found.homography)
     assert transfer_errors(corners, ends, WARP).max() < 0.2
@@ -185,4 +183,4 @@ def test_flat_images_keep_the_start_and_show_no_depth() -> None:
     flat = np.full((120, 160), 90, np.uint8)
     found = PlaneTracks(ImagePair((flat, flat)), TRUE)
     np.testing.assert_array_equal(found.homography, TRUE)
-    assert not found.parallax().shows_depth
+    assert not found.show_depth()

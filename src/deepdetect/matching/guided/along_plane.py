@@ -12,8 +12,6 @@ plane", 2005). Lens distortion, wind and wrong tracks displace places in any dir
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..._shared.opencv import cv2
@@ -65,32 +63,6 @@ FAR = 3.0
 NOTHING: Pair = np.empty((0, 2)), np.empty((0, 2))
 
 
-@dataclass(frozen=True)
-class Parallax:
-    """How the places off a plane move.
-
-    Attributes:
-        aligned: fraction of the places off the plane that agree with the best epipole.
-        share: fraction of all places that are off the plane and agree with it.
-        far_aligned, far_share: the same of the places that are clearly off the plane.
-    """
-
-    aligned: float = 0.0
-    share: float = 0.0
-    far_aligned: float = 0.0
-    far_share: float = 0.0
-
-    @property
-    def shows_depth(self) -> bool:
-        """Whether the scene has depth."""
-        return self.aligned >= MIN_ALIGNED and self.share >= MIN_SHARE
-
-    @property
-    def shows_foreground(self) -> bool:
-        """Whether something stands before the plane, or behind it, however small."""
-        return self.far_aligned >= MIN_ALIGNED and self.far_share >= MIN_FAR_SHARE
-
-
 class PlaneTracks:
     """Corners and matches, (M, 2) in both images, tracked relative to the plane of a homography.
 
@@ -133,22 +105,19 @@ class PlaneTracks:
             gain += np.count_nonzero(_on_plane(transform_points(starts, found), ends) & ~used)
         return bool(gain >= 0)
 
-    def parallax(self, seed: int = 0) -> Parallax:
-        """Return how the places off the plane move."""
+    def show_depth(self, foreground: bool = False, seed: int = 0) -> bool:
+        """Return whether the scene has depth, or, if asked, something clearly before its plane."""
         _, one = np.unique((self._starts // CELL_PX).astype(int), axis=0, return_index=True)
         places, moved = self._starts[one], (self._ends - self._starts)[one]
         length = np.linalg.norm(moved, axis=1)
-        off = length > NOISE_PX
+        off, count = length > NOISE_PX, len(length)
         if np.count_nonzero(off) < 3:
-            return Parallax()
+            return False
         agreeing = _agreeing(places[off], moved[off] / length[off, None], self._side, seed)
         far = length[off] > FAR * NOISE_PX
-        clear, clearly_off = (int(np.count_nonzero(each)) for each in (agreeing & far, far))
-        return Parallax(
-            float(agreeing.mean()),
-            float(agreeing.sum() / len(off)),
-            clear / max(clearly_off, 1),
-            clear / len(off),
+        kinds = [(agreeing, MIN_SHARE), *([(agreeing[far], MIN_FAR_SHARE)] if foreground else [])]
+        return any(
+            kind.sum() >= max(MIN_ALIGNED * len(kind), least * count) for kind, least in kinds
         )
 
 

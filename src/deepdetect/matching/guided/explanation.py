@@ -452,8 +452,7 @@ def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
 def _is_deep(flat: Layer, seed: int) -> bool:
     """Return whether a scene has depth that a plane does not explain."""
     assert flat.tracks is not None
-    parallax = flat.tracks.parallax(seed)
-    return parallax.shows_depth or (flat.evidence.share < NEARLY_ALL and parallax.shows_foreground)
+    return flat.tracks.show_depth(flat.evidence.share < NEARLY_ALL, seed)
 
 
 def _is_doubtful(flat: Layer, epipolar: Hypothesis) -> bool:
