@@ -229,12 +229,11 @@ class Explanation:
             flat = None
         if epipolar is not None:
             deep, best = None, part or flat
-            seen = part is not None or flat is None or _is_deep(flat, self._seed)
-            if seen or (flat is not None and _is_doubtful(flat, epipolar)):
+            if part is not None or flat is None or _is_deep(flat, self._seed):
                 deep = self._along_rows(pair, judge, epipolar, best, free)
                 if deep and part and self._is_flat(deep, part):
                     part = deep = None
-            if deep is not None and (best is None or _wins(deep, best, seen)):
+            if deep is not None and (best is None or _wins(deep, best)):
                 yield deep
             else:
                 sparse.append(self._sparse(epipolar))
@@ -455,12 +454,6 @@ def _is_deep(flat: Layer, seed: int) -> bool:
     return flat.tracks.show_depth(flat.evidence.share < NEARLY_ALL, seed)
 
 
-def _is_doubtful(flat: Layer, epipolar: Hypothesis) -> bool:
-    """Return whether a plane leaves so much unexplained that depth may explain more."""
-    few = not _mostly(flat.hypothesis.inliers, epipolar.inliers, NEARLY_ALL)
-    return few and flat.evidence.share < MOST
-
-
 def _copies(plane: Layer, other: Layer) -> bool:
     """Return whether a plane explains less than another, and mostly the same parts of the image."""
     both = plane.evidence.explained & other.evidence.explained
@@ -469,14 +462,12 @@ def _copies(plane: Layer, other: Layer) -> bool:
     return bool(fewer and np.count_nonzero(both) >= least)
 
 
-def _wins(deep: Layer, flat: Layer, seen: bool) -> bool:
-    """Return whether depth explains as much as a plane; if depth is `seen`, half of it.
+def _wins(deep: Layer, flat: Layer) -> bool:
+    """Return whether depth explains half of what a plane does.
 
-    Dense matches may be few: it is enough, too, if depth explains nearly all of what the plane
+    Dense matches may be few: it is also enough if depth explains nearly all of what the plane
     does, where it compares the images.
     """
-    if not seen:
-        return deep.evidence.windows >= flat.evidence.windows
     compared = flat.evidence.explained & np.isfinite(deep.evidence.similarity)
     kept = _mostly(compared & deep.evidence.explained, compared, MIN_KEPT)
     return kept or deep.evidence.windows >= flat.evidence.windows / 2
