@@ -183,15 +183,15 @@ class Explanation:
         """Yield layers that the images confirm, the best first, then sparse ones."""
         pair, judge = self._seen(tentative.cross_modal)
         epipolar, (refuted, chance) = None, np.zeros((2, len(tentative.points0)), bool)
-        surely, least = False, np.inf if free is None else HIGH_LOG10_NFA
+        surely, limit = False, np.inf if free is None else HIGH_LOG10_NFA
         if self._asked != "homography":
             epipolar = propose(pair, tentative, "fundamental", self._seed)
         sparse: list[Layer] = []
         flats: list[Hypothesis] = []
         if self._asked != "fundamental":
             flats = [*planes(pair, tentative, self._seed)]
-        epipolar = None if epipolar is None or epipolar.log10_nfa >= least else epipolar
-        flats = [each for each in flats if each.log10_nfa < least]
+        epipolar = None if epipolar is None or epipolar.log10_nfa >= limit else epipolar
+        flats = [each for each in flats if each.log10_nfa < limit]
         flat: Layer | None = None
         tracks: Pair | None = None
         refuting: list[Layer] = []
@@ -469,8 +469,8 @@ def _wins(deep: Layer, flat: Layer) -> bool:
     does, where it compares the images.
     """
     compared = flat.evidence.explained & np.isfinite(deep.evidence.similarity)
-    kept = _mostly(compared & deep.evidence.explained, compared, MIN_KEPT)
-    return kept or deep.evidence.windows >= flat.evidence.windows / 2
+    kept = compared.any() and _mostly(compared & deep.evidence.explained, compared, MIN_KEPT)
+    return bool(kept) or deep.evidence.windows >= flat.evidence.windows / 2
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
