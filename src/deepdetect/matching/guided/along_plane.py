@@ -57,6 +57,11 @@ these are MIN_SHARE of all tracks. Something stands before the plane if the same
 MIN_FAR_SHARE, of the tracks that are off it by more than FAR times the noise. By chance, 0.16 of
 the tracks agree with the best epipole."""
 
+SURE_SHARE = 1 / 3
+"""A scene also has depth if this fraction of all tracks are off the plane and agree with one
+epipole: on planes of Oxford they are up to 0.23, on smooth surfaces in small images 0.26 to 0.69,
+some of them with directions that are mostly noise."""
+
 FAR = 3.0
 
 
@@ -78,7 +83,7 @@ class PlaneTracks:
             for side, (size, scale) in enumerate(zip(pair.sizes, scales, strict=True))
         )
         self._side = max(first.shape)
-        matrix = scaled_homography(homography, scale0, scale1)
+        matrix = self._matrix = scaled_homography(homography, scale0, scale1)
         ends = scaled_points(matches[0], scale0), scaled_points(matches[1], scale1)
         self._starts, self._ends = _tracked(first, second, matrix, ends)
         moved = transform_points(self._ends, matrix)
@@ -110,10 +115,16 @@ class PlaneTracks:
         _, one = np.unique((self._starts // CELL_PX).astype(int), axis=0, return_index=True)
         places, moved = self._starts[one], (self._ends - self._starts)[one]
         length = np.linalg.norm(moved, axis=1)
+        # Where the second image is foreshortened, less than one of its pixels is noise, too.
+        seen = transform_points(self._ends[one], self._matrix)
+        seen -= transform_points(places, self._matrix)
+        length = np.minimum(length, np.linalg.norm(seen, axis=1))
         off, count = length > NOISE_PX, len(length)
         if np.count_nonzero(off) < 3:
             return False
-        agreeing = _agreeing(places[off], moved[off] / length[off, None], self._side, seed)
+        agreeing = _agreeing(places[off], moved[off], self._side, seed)
+        if agreeing.sum() >= SURE_SHARE * count:
+            return True
         far = length[off] > FAR * NOISE_PX
         kinds = [(agreeing, MIN_SHARE), *([(agreeing[far], MIN_FAR_SHARE)] if foreground else [])]
         return any(
@@ -189,8 +200,9 @@ def _scales_at_centre(homography: np.ndarray, size: tuple[int, int]) -> tuple[fl
     return 1.0, 1.0
 
 
-def _agreeing(places: np.ndarray, directions: np.ndarray, side: int, seed: int) -> np.ndarray:
-    """Return which of (N, 2) directions agree with the epipole with which most agree, (N,) bool."""
+def _agreeing(places: np.ndarray, moved: np.ndarray, side: int, seed: int) -> np.ndarray:
+    """Return which of (N, 2) motions agree with the epipole with which most agree, (N,) bool."""
+    directions = moved / np.linalg.norm(moved, axis=1)[:, None]
     places = np.column_stack([places / side - 0.5, np.ones(len(places))])
     lines = np.cross(places, np.column_stack([directions, np.zeros(len(directions))]))
     chosen = np.random.default_rng(seed).integers(0, len(lines), (SAMPLES, 2))

@@ -265,7 +265,7 @@ class Explanation:
         tracks = PlaneTracks(pair, plane.matrix, (some.points0, some.points1))
         view = judge.along_plane(tracks.homography)
         evidence = self._on_free(view.evidence, free)
-        exact, matches = replace(plane, matrix=tracks.homography), NO_MATCHES
+        exact, matches = plane.made_exact(tracks.homography, pair.sizes[1]), NO_MATCHES
         if evidence.confirms or not evidence.compares:
             matches = match_along_plane(pair, self.pixels, exact.matrix, judge, evidence)
         return Layer(exact, matches, evidence, tracks, evidence.confirms and view.repeated)
