@@ -29,6 +29,7 @@ from ..geometry.transforms import (
 from ..io.image import Images, load_pixels, luma, one_range
 from ..io.image_file import file_name, is_file
 from ..io.picture_file import read_metadata
+from .guided.judge import contradicts
 from .pipeline import match_images
 
 Extent = Literal["reference", "union"]
@@ -38,12 +39,6 @@ MAX_UNION = 4
 
 SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
-
-MIN_AGREEMENT, CLEAR_CORRELATION = 0.75, 0.5
-"""Two images contradict a homography if less than MIN_AGREEMENT of their structure agrees with it,
-unless their median correlation is CLEAR_CORRELATION or more: under other light, as by night, the
-rest may differ. Street views 5 m apart, of which only the road fits, reach 0.74 and 0.48."""
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Registration:
@@ -169,8 +164,7 @@ def register(
             "no homography can be trusted: both images must show a plane or be taken from one place"
         )
     homography, left_out = geometry.matrix, geometry.evidence.left_out
-    clear = geometry.evidence.correlation >= CLEAR_CORRELATION
-    if geometry.evidence.agreement < MIN_AGREEMENT and not clear:
+    if contradicts(geometry.evidence):
         raise RegistrationError(
             "the images contradict the homography of their matches: warped, they are no more alike "
             "than shifted copies; check that both show one plane or are taken from one place"

@@ -50,16 +50,10 @@ def test_photographs_of_scikit_image(scene: str) -> None:
     assert scene_of(pairs[scene]).split()[0] == scene
 
 
-too_small = pytest.mark.xfail(
-    reason="the cloth's parallax is about that of Oxford's wall, which is planar", strict=True
-)
-
-
 @pytest.mark.parametrize(
     ("folder", "names", "scene"),
     [
-        *((f"middlebury/{name}", "left right", "depth") for name in SMALL_PARALLAX[1:]),
-        pytest.param("middlebury/cloth", "left right", "depth", marks=too_small),
+        *((f"middlebury/{name}", "left right", "depth") for name in SMALL_PARALLAX),
         *((f"middlebury/{name}", "left right", "depth") for name in ("art", "cones", "teddy")),
         ("oxford/graf", "img1 img2", "planar"),
         ("oxford/graf", "img1 img3", "planar"),

@@ -74,9 +74,17 @@ class PlaneTracks:
     Attributes:
         homography: (3, 3), fitted to the tracks if that makes it more exact.
         points: (N, 2) in each image, where the tracks start and end.
+
+    If given, the (rows, columns) bool squares of the first image that are `free` have corners.
     """
 
-    def __init__(self, pair: ImagePair, homography: np.ndarray, matches: Pair = NOTHING) -> None:
+    def __init__(
+        self,
+        pair: ImagePair,
+        homography: np.ndarray,
+        matches: Pair = NOTHING,
+        free: np.ndarray | None = None,
+    ) -> None:
         scales = _scales_at_centre(homography, pair.sizes[0])
         (first, scale0), (second, scale1) = (
             pair.reduced(side, min(SIDE_PX, round(max(size) * scale)))
@@ -85,7 +93,7 @@ class PlaneTracks:
         self._side = max(first.shape)
         matrix = self._matrix = scaled_homography(homography, scale0, scale1)
         ends = scaled_points(matches[0], scale0), scaled_points(matches[1], scale1)
-        self._starts, self._ends = _tracked(first, second, matrix, ends)
+        self._starts, self._ends = _tracked(first, second, matrix, ends, free)
         moved = transform_points(self._ends, matrix)
         self.points = scaled_points(self._starts, 1 / scale0), scaled_points(moved, 1 / scale1)
         self.homography = homography
@@ -164,10 +172,19 @@ def _fitted(starts: np.ndarray, ends: np.ndarray, threshold_px: float) -> np.nda
     return cv2.findHomography(starts[near], ends[near])[0] if near.sum() >= MIN_TRACKS else None
 
 
-def _tracked(first: np.ndarray, second: np.ndarray, matrix: np.ndarray, matches: Pair) -> Pair:
+def _tracked(
+    first: np.ndarray,
+    second: np.ndarray,
+    matrix: np.ndarray,
+    matches: Pair,
+    free: np.ndarray | None,
+) -> Pair:
     """Return (N, 2) starts of tracks in the first image, and their ends, moved there."""
     warped, valid = warp_to_reference(second, matrix, first.shape[::-1], exact=True)
     inside = cv2.erode(valid.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX)), borderValue=0)
+    if free is not None:
+        size = inside.shape[::-1]
+        inside &= cv2.resize(free.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     equalised = equalise(first)
     corners = cv2.goodFeaturesToTrack(equalised, CORNERS, 0.001, 5, mask=inside)
     starts = np.empty((0, 2)) if corners is None else corners.reshape(-1, 2)

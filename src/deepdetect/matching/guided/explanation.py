@@ -22,7 +22,7 @@ from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rota
 from .along_plane import PlaneTracks, match_along_plane
 from .along_rows import match_by_rectification
 from .image_pair import ImagePair, Pair
-from .judge import Evidence, Judge
+from .judge import Evidence, Judge, contradicts
 from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
 
 MIN_MATCHED_FRACTION = 0.02
@@ -57,8 +57,8 @@ repeated pattern apart. On printed circuit boards, the fraction is 0.45 to 0.9, 
 with windows that are all alike up to 0.68."""
 
 MIN_GAIN = 1.05
-"""A plane moves on its own if a fundamental matrix of the rest alone fits this many times as many
-matches of the rest as the matrix of all, and less than a third of those on the plane."""
+"""A plane moves on its own if it and a fundamental matrix of the rest alone fit this many times as
+many matches as the matrix of all, and this one fits less than a third of those on the plane."""
 
 MAX_STILL = 0.005
 """A homography that moves the corners by less than this fraction of the longer side stands still:
@@ -142,10 +142,10 @@ class Explanation:
             fallback = found
         if not layers:
             return [] if fallback is None else [fallback]
-        free = np.ones(len(tentative.points0), bool)
         explained = layers[0].evidence.explained
         if self._asked != "auto":
             return layers
+        free = np.ones(len(tentative.points0), bool)
         while len(layers) < MAX_LAYERS:
             last = layers[-1].hypothesis
             errors = last.errors(tentative.points0, tentative.points1)
@@ -262,7 +262,7 @@ class Explanation:
         """Return what a plane explains once it is exact."""
         agreeing = plane.inliers if epipolar is None else plane.inliers | epipolar.inliers
         some = plane.tentative.chosen(agreeing)
-        tracks = PlaneTracks(pair, plane.matrix, (some.points0, some.points1))
+        tracks = PlaneTracks(pair, plane.matrix, (some.points0, some.points1), free)
         view = judge.along_plane(tracks.homography)
         evidence = self._on_free(view.evidence, free)
         exact, matches = plane.made_exact(tracks.homography, pair.sizes[1]), NO_MATCHES
@@ -283,7 +283,7 @@ class Explanation:
             inliers = np.zeros(len(off), bool)
             inliers[np.flatnonzero(off)[rest.inliers]] = True
             along = rest.errors(*plane.points) < 2 * rest.threshold_px
-            gain = np.count_nonzero(inliers) > MIN_GAIN * np.count_nonzero(epipolar.inliers & off)
+            gain = _mostly(inliers | plane.inliers, epipolar.inliers, MIN_GAIN)
             if gain and np.mean(along) < 1 / 3:
                 return replace(rest, inliers=inliers, tentative=tentative)
         return epipolar
@@ -376,13 +376,7 @@ class Explanation:
             alike = ~first.evidence.contradicted[cells]
             for layer in self.layers[1:]:
                 alike |= layer.evidence.explained[cells]
-        strong = first.evidence.share >= HIGH_SHARE and own.log10_nfa < HIGH_LOG10_NFA
-        high = (
-            first.confirmed
-            and strong
-            and not first.repeated
-            and len(first.matches) >= MOST * len(matches)
-        )
+        high = len(first.matches) >= MOST * len(matches) and self._is_sure(first)
         evidence = PublicEvidence(
             len(own.tentative.points0),
             int(np.count_nonzero(own.inliers)),
@@ -400,6 +394,17 @@ class Explanation:
         )
         geometry = self._with_scene(geometry, starts, matches.points1)
         return geometry, replace(matches, alike=alike, layer=number)
+
+    def _is_sure(self, layer: Layer) -> bool:
+        """Return whether the images and the sparse matches leave no doubt about the first layer."""
+        own, seen = layer.hypothesis, layer.evidence
+        least = HIGH_SHARE if len(self.layers) == 1 else MOST
+        if own.model == "homography" and stands_still(own.matrix, self._pair.sizes):
+            unlike = seen.agreement < NEARLY_ALL  # as behind an overlay
+        else:
+            unlike = contradicts(seen)
+        strong = seen.share >= least and own.log10_nfa < HIGH_LOG10_NFA
+        return layer.confirmed and strong and not (layer.repeated or unlike)
 
     def _with_scene(
         self, geometry: TwoViewGeometry, points0: np.ndarray, points1: np.ndarray
