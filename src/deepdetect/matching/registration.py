@@ -40,6 +40,7 @@ MAX_UNION = 4
 SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
 
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Registration:
     """Two images in one frame: the second is warped to the first by a homography.

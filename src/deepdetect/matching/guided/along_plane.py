@@ -93,7 +93,7 @@ class PlaneTracks:
         self._side = max(first.shape)
         matrix = self._matrix = scaled_homography(homography, scale0, scale1)
         ends = scaled_points(matches[0], scale0), scaled_points(matches[1], scale1)
-        self._starts, self._ends = _tracked(first, second, matrix, ends, free)
+        self._starts, self._ends = _tracked((first, second), matrix, ends, free)
         moved = transform_points(self._ends, matrix)
         self.points = scaled_points(self._starts, 1 / scale0), scaled_points(moved, 1 / scale1)
         self.homography = homography
@@ -172,14 +172,9 @@ def _fitted(starts: np.ndarray, ends: np.ndarray, threshold_px: float) -> np.nda
     return cv2.findHomography(starts[near], ends[near])[0] if near.sum() >= MIN_TRACKS else None
 
 
-def _tracked(
-    first: np.ndarray,
-    second: np.ndarray,
-    matrix: np.ndarray,
-    matches: Pair,
-    free: np.ndarray | None,
-) -> Pair:
+def _tracked(views: Pair, matrix: np.ndarray, matches: Pair, free: np.ndarray | None) -> Pair:
     """Return (N, 2) starts of tracks in the first image, and their ends, moved there."""
+    first, second = views
     warped, valid = warp_to_reference(second, matrix, first.shape[::-1], exact=True)
     inside = cv2.erode(valid.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX)), borderValue=0)
     if free is not None:

@@ -44,10 +44,6 @@ that move is below HIGH_LOG10_NFA, and below this among the matches nearby. Thos
 may come from the borders, which descriptors see, or from a frame. Wrong ones of 40 sparse answers
 reach -2.3 among the matches nearby."""
 
-MIN_KEPT = 0.8
-"""Depth explains nearly all of what a plane does if it explains this fraction. Correct depth
-explains 0.86 or more, that of wrong fundamental matrices of entry 0.46 to 0.94."""
-
 OFF_RATIO = 4.0
 """Tentative matches with errors above this multiple of the inlier threshold are not explained."""
 
@@ -231,9 +227,9 @@ class Explanation:
             deep, best = None, part or flat
             if part is not None or flat is None or _is_deep(flat, self._seed):
                 deep = self._along_rows(pair, judge, epipolar, best, free)
-                if deep and part and self._is_flat(deep, part):
-                    part = deep = None
-            if deep is not None and (best is None or _wins(deep, best)):
+            if deep is not None and (
+                best is None or 2 * deep.evidence.windows >= best.evidence.windows
+            ):
                 yield deep
             else:
                 sparse.append(self._sparse(epipolar))
@@ -244,12 +240,6 @@ class Explanation:
         sparse = [each for each in sparse if self._suffices(each)]
         if sparse and free is None and not (nothing and refuted.any()):
             yield min(sparse, key=lambda each: each.hypothesis.log10_nfa)
-
-    def _is_flat(self, deep: Layer, plane: Layer) -> bool:
-        """Return whether dense matches stay on a plane that is better founded than their depth."""
-        starts, own = deep.matches.starts(self.pixels[0]), plane.hypothesis
-        near = own.errors(starts, deep.matches.points1) < own.threshold_px
-        return own.log10_nfa < deep.hypothesis.log10_nfa and bool(near.mean() >= NEARLY_ALL)
 
     def _seen_plane(
         self,
@@ -265,7 +255,7 @@ class Explanation:
         tracks = PlaneTracks(pair, plane.matrix, (some.points0, some.points1), free)
         view = judge.along_plane(tracks.homography)
         evidence = self._on_free(view.evidence, free)
-        exact, matches = plane.made_exact(tracks.homography, pair.sizes[1]), NO_MATCHES
+        exact, matches = replace(plane, matrix=tracks.homography), NO_MATCHES
         if evidence.confirms or not evidence.compares:
             matches = match_along_plane(pair, self.pixels, exact.matrix, judge, evidence)
         return Layer(exact, matches, evidence, tracks, evidence.confirms and view.repeated)
@@ -465,17 +455,6 @@ def _copies(plane: Layer, other: Layer) -> bool:
     least = np.count_nonzero(plane.evidence.explained) / 2
     fewer = plane.evidence.windows <= other.evidence.windows
     return bool(fewer and np.count_nonzero(both) >= least)
-
-
-def _wins(deep: Layer, flat: Layer) -> bool:
-    """Return whether depth explains half of what a plane does.
-
-    Dense matches may be few: it is also enough if depth explains nearly all of what the plane
-    does, where it compares the images.
-    """
-    compared = flat.evidence.explained & np.isfinite(deep.evidence.similarity)
-    kept = compared.any() and _mostly(compared & deep.evidence.explained, compared, MIN_KEPT)
-    return bool(kept) or deep.evidence.windows >= flat.evidence.windows / 2
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:

@@ -19,8 +19,6 @@ from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
 from ...features.learned import CROSS_MODAL, LEARNED, is_learned, match_learned, ratio_limit
 from ...features.matchers import exact_neighbours, match_descriptors
-from ...geometry.camera import Size
-from ...geometry.estimation import log10_nfa
 from ...geometry.refinement import refine_fundamental
 from ...geometry.transforms import epipolar_errors, scaled_points, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model
@@ -117,15 +115,6 @@ class Hypothesis:
             return self
         sources = self.points, (tracks[0][near], tracks[1][near])
         return replace(self, matrix=refine_fundamental(sources, self.matrix, pair.sizes))
-
-    def made_exact(self, homography: np.ndarray, size1: Size) -> Hypothesis:
-        """Return the plane of a more exact homography, with the matches that agree with it."""
-        exact = replace(self, matrix=homography)
-        inliers = exact.errors(self.tentative.points0, self.tentative.points1) < self.threshold_px
-        if np.count_nonzero(inliers) < np.count_nonzero(self.inliers):
-            return replace(self, matrix=homography)
-        alarms = log10_nfa(inliers, self.model, self.threshold_px, size1)
-        return replace(exact, inliers=inliers, log10_nfa=alarms)
 
     def errors(self, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
         """Return the (N,) errors of matches, in pixels."""
