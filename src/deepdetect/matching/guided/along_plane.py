@@ -59,8 +59,7 @@ the tracks agree with the best epipole."""
 
 SURE_SHARE = 1 / 3
 """A scene also has depth if this fraction of all tracks are off the plane and agree with one
-epipole: on planes of Oxford they are up to 0.23, on smooth surfaces in small images 0.26 to 0.69,
-some of them with directions that are mostly noise."""
+epipole. On planes of Oxford they are up to 0.23, on curved surfaces in small images up to 0.69."""
 
 FAR = 3.0
 
@@ -71,11 +70,11 @@ NOTHING: Pair = np.empty((0, 2)), np.empty((0, 2))
 class PlaneTracks:
     """Corners and matches, (M, 2) in both images, tracked relative to the plane of a homography.
 
+    Corners start in the `free` ones of (rows, columns) bool squares of the first image, if given.
+
     Attributes:
         homography: (3, 3), fitted to the tracks if that makes it more exact.
         points: (N, 2) in each image, where the tracks start and end.
-
-    If given, the (rows, columns) bool squares of the first image that are `free` have corners.
     """
 
     def __init__(
@@ -123,7 +122,7 @@ class PlaneTracks:
         _, one = np.unique((self._starts // CELL_PX).astype(int), axis=0, return_index=True)
         places, moved = self._starts[one], (self._ends - self._starts)[one]
         length = np.linalg.norm(moved, axis=1)
-        # Where the second image is foreshortened, less than one of its pixels is noise, too.
+        # Less than one pixel of the second image, which may be foreshortened, is noise, too.
         seen = transform_points(self._ends[one], self._matrix)
         seen -= transform_points(places, self._matrix)
         length = np.minimum(length, np.linalg.norm(seen, axis=1))

@@ -81,21 +81,13 @@ NO_MATCHES = GuidedMatches(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """What one geometry explains; a plane also has the tracks that made it exact.
-
-    A displaced copy explains the images as well as a `repeated` geometry.
-    """
+    """What one geometry explains; a displaced copy explains as much as a `repeated` plane."""
 
     hypothesis: Hypothesis
     matches: GuidedMatches
     evidence: Evidence
     tracks: PlaneTracks | None = None
     repeated: bool = False
-
-    @property
-    def confirmed(self) -> bool:
-        """Whether the images confirm the geometry; if not, only sparse matches speak for it."""
-        return self.evidence.confirms
 
 
 class Explanation:
@@ -132,7 +124,7 @@ class Explanation:
                 fallback is not None and found.hypothesis.log10_nfa > fallback.hypothesis.log10_nfa
             ):
                 continue  # what explains more is better, also without the images
-            if found.confirmed:
+            if found.evidence.confirms:
                 layers.append(found)
                 break
             fallback = found
@@ -147,7 +139,7 @@ class Explanation:
             errors = last.errors(tentative.points0, tentative.points1)
             free &= errors > OFF_RATIO * last.threshold_px
             further = next(self._confirmed(tentative.chosen(free), ~explained), None)
-            if further is None or not further.confirmed:
+            if further is None or not further.evidence.confirms:
                 break
             layers.append(further)
             explained = explained | further.evidence.explained
@@ -189,17 +181,16 @@ class Explanation:
         epipolar = None if epipolar is None or epipolar.log10_nfa >= limit else epipolar
         flats = [each for each in flats if each.log10_nfa < limit]
         flat: Layer | None = None
-        tracks: Pair | None = None
+        tracks: PlaneTracks | None = None
         refuting: list[Layer] = []
         for plane in flats:
             layer = self._seen_plane(pair, judge, plane, epipolar, free)
-            assert layer.tracks is not None
-            own, tracks = layer.hypothesis, layer.tracks.points
+            own, tracks = layer.hypothesis, layer.tracks
             self.best_nfa = min(self.best_nfa, own.log10_nfa)
             clear = free is None and _mostly(own.inliers, np.ones_like(own.inliers), MIN_CHOSEN)
             if layer.evidence.is_chance:
                 chance |= own.inliers
-            elif not layer.confirmed:
+            elif not layer.evidence.confirms:
                 sparse.append(self._sparse(own) if layer.evidence.compares else layer)
             elif (layer.repeated and not clear) or any(_copies(layer, each) for each in refuting):
                 refuting.append(layer)
@@ -220,16 +211,18 @@ class Explanation:
             epipolar = self._apart(pair, flats, epipolar)
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
             if tracks is not None:
-                epipolar = epipolar.refitted(pair, tracks)
+                epipolar = epipolar.refitted(pair, tracks.points)
         if flat is not None and len(flat.matches) < self._enough:
             flat = None
         if epipolar is not None:
             deep, best = None, part or flat
-            if part is not None or flat is None or _is_deep(flat, self._seed):
-                deep = self._along_rows(pair, judge, epipolar, best, free)
-            if deep is not None and (
-                best is None or 2 * deep.evidence.windows >= best.evidence.windows
+            if (
+                part
+                or flat is None
+                or (tracks and tracks.show_depth(flat.evidence.share < NEARLY_ALL, self._seed))
             ):
+                deep = self._along_rows(pair, judge, epipolar, best, free)
+            if deep and (best is None or 2 * deep.evidence.windows >= best.evidence.windows):
                 yield deep
             else:
                 sparse.append(self._sparse(epipolar))
@@ -360,7 +353,7 @@ class Explanation:
             number[np.isin(matches.indices0, layer.matches.indices0)] = k
         starts = matches.starts(self.pixels[0])
         alike = np.ones(len(matches), bool)
-        if first.confirmed and own.model == "fundamental":
+        if first.evidence.confirms and own.model == "fundamental":
             _, judge = self._seen(own.tentative.cross_modal)
             cells = judge.cells_of(starts)
             alike = ~first.evidence.contradicted[cells]
@@ -389,12 +382,11 @@ class Explanation:
         """Return whether the images and the sparse matches leave no doubt about the first layer."""
         own, seen = layer.hypothesis, layer.evidence
         least = HIGH_SHARE if len(self.layers) == 1 else MOST
+        unlike = contradicts(seen)
         if own.model == "homography" and stands_still(own.matrix, self._pair.sizes):
-            unlike = seen.agreement < NEARLY_ALL  # as behind an overlay
-        else:
-            unlike = contradicts(seen)
+            unlike |= seen.agreement < NEARLY_ALL  # as behind an overlay
         strong = seen.share >= least and own.log10_nfa < HIGH_LOG10_NFA
-        return layer.confirmed and strong and not (layer.repeated or unlike)
+        return layer.evidence.confirms and strong and not (layer.repeated or unlike)
 
     def _with_scene(
         self, geometry: TwoViewGeometry, points0: np.ndarray, points1: np.ndarray
@@ -441,12 +433,6 @@ def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
             "the lens of both images bends straight lines, as that of a fisheye, which no "
             f"pinhole geometry fits: {UNDISTORT}"
         )
-
-
-def _is_deep(flat: Layer, seed: int) -> bool:
-    """Return whether a scene has depth that a plane does not explain."""
-    assert flat.tracks is not None
-    return flat.tracks.show_depth(flat.evidence.share < NEARLY_ALL, seed)
 
 
 def _copies(plane: Layer, other: Layer) -> bool:
