@@ -122,7 +122,7 @@ class PlaneTracks:
         _, one = np.unique((self._starts // CELL_PX).astype(int), axis=0, return_index=True)
         places, moved = self._starts[one], (self._ends - self._starts)[one]
         length = np.linalg.norm(moved, axis=1)
-        # Less than one pixel of the second image, which may be foreshortened, is noise, too.
+        # Less than a pixel of the second image, which may be foreshortened, is also noise.
         seen = transform_points(self._ends[one], self._matrix)
         seen -= transform_points(places, self._matrix)
         length = np.minimum(length, np.linalg.norm(seen, axis=1))
