@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from deepdetect.geometry import transfer_errors, transform_points
-from deepdetect.io.image import luma
+from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided import ImagePair, Sources
 from deepdetect.matching.guided.along_plane import MAX_DISTANCE_PX as REACH
 from deepdetect.matching.guided.along_plane import PlaneTracks, match_along_plane
@@ -177,6 +177,29 @@ def test_a_plane_shows_no_depth(warped_pair: ImagePair, off_px: float) -> None:
     corners = np.array([[20.0, 20], [230, 20], [20, 230], [230, 230]])
     ends = transform_points(corners, found.homography)
     assert transfer_errors(corners, ends, WARP).max() < 0.2
+
+
+def test_only_free_squares_are_tracked(gray: np.ndarray) -> None:
+    """The left two thirds stand still, so that tracks there would lead back to no motion."""
+    second, two_thirds = warped(gray, TRUE), 2 * gray.shape[1] // 3
+    second[:, :two_thirds] = gray[:, :two_thirds]
+    free = np.zeros((30, 45), bool)
+    free[:, 31:] = True
+    images = ImagePair((gray, second))
+    found = PlaneTracks(images, TRUE @ OFF, free=free)
+    assert error(found.homography, gray.shape, two_thirds + 20) < 0.3
+    assert found.points[0][:, 0].min() > two_thirds
+
+
+def test_noise_along_a_foreshortened_direction_is_no_depth(shared: Path) -> None:
+    """The second image squeezes the first to a fifth of its width; one pixel there is five here."""
+    first = luma(load_image(shared / "data/fountain/0004.jpg"))
+    first = cv2.resize(first, (640, 480), interpolation=cv2.INTER_AREA)
+    squeeze, seen = np.diag([0.2, 1.0, 1.0]), cv2.GaussianBlur(first, (0, 0), 2.5, sigmaY=0.5)
+    seen = cv2.warpAffine(seen, squeeze[:2], (128, 480))
+    noise = np.random.default_rng(0).normal(0, 10, seen.shape)
+    second = np.clip(seen + noise, 0, 255).astype(np.uint8)
+    assert not PlaneTracks(ImagePair((first, second)), squeeze).show_depth()
 
 
 def test_flat_images_keep_the_start_and_show_no_depth() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided import Explanation, ImagePair
 from deepdetect_lab.datasets.middlebury import load_middlebury
 from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
+from deepdetect_lab.evaluation.acceptance import synthetic
 from deepdetect_lab.evaluation.metrics.pose import translation_error
 from deepdetect_lab.evaluation.metrics.stereo import stereo_score
 from deepdetect_lab.evaluation.protocols.pose import estimate_pose
@@ -193,6 +195,25 @@ def test_a_frame_that_stands_still_is_no_motion(photo: np.ndarray) -> None:
         matches = match(*views, Everywhere())
     errors = transfer_errors(matches.points0, matches.points1, np.vstack([turn, [0, 0, 1]]))
     assert (errors < 1).mean() > 0.95
+
+
+@pytest.mark.parametrize("number", [14, 32])
+def test_a_still_overlay_of_a_scene_that_is_not_found_is_not_trusted_highly(
+    shared: Path, number: int
+) -> None:
+    """40 % of the image is a texture that stands still; the scene behind it moves far."""
+    pair = next(islice(synthetic.overlays(shared / "data"), number, None))
+    found = match_images(*pair.make())
+    assert found.geometry is not None
+    assert found.geometry.confidence != "high" or pair.truth.judge(found) == "right"
+
+
+@pytest.mark.filterwarnings("ignore:.*stands still")
+def test_matches_off_a_plane_of_a_facade_are_no_motion_of_their_own(shared: Path) -> None:
+    """A wrong matrix of 73 matches off the second plane of entry 1-5 replaced one of 628."""
+    pair = next(islice(synthetic.frames(shared / "data"), 5, None))
+    found = match_images(*pair.make())
+    assert pair.truth.pose_error(found.points0, found.points1) < 1
 
 
 @pytest.mark.slow
