@@ -44,6 +44,9 @@ that move is below HIGH_LOG10_NFA, and below this among the matches nearby. Thos
 may come from the borders, which descriptors see, or from a frame. Wrong ones of 40 sparse answers
 reach -2.3 among the matches nearby."""
 
+MIN_KEPT = 0.8
+"""Depth also wins over a plane if it explains this fraction of what it compares of the plane."""
+
 OFF_RATIO = 4.0
 """Tentative matches with errors above this multiple of the inlier threshold are not explained."""
 
@@ -152,9 +155,8 @@ class Explanation:
         ]
         least = MIN_MOVING * layers[0].evidence.windows
         if moving and moving[0].evidence.windows >= least:
-            self.left_out = float(
-                sum(each.evidence.explained.mean() for each in layers if each not in moving)
-            )
+            still = (each.evidence.explained.mean() for each in layers if each not in moving)
+            self.left_out = float(sum(still))
             return moving
         return layers
 
@@ -169,22 +171,21 @@ class Explanation:
 
     def _confirmed(self, tentative: Tentative, free: np.ndarray | None = None) -> Iterator[Layer]:
         """Yield layers that the images confirm, the best first, then sparse ones."""
-        pair, judge = self._seen(tentative.cross_modal)
         epipolar, (refuted, chance) = None, np.zeros((2, len(tentative.points0)), bool)
         surely, limit = False, np.inf if free is None else HIGH_LOG10_NFA
         if self._asked != "homography":
-            epipolar = propose(pair, tentative, "fundamental", self._seed)
+            epipolar = propose(self._pair, tentative, "fundamental", self._seed)
         sparse: list[Layer] = []
         flats: list[Hypothesis] = []
         if self._asked != "fundamental":
-            flats = [*planes(pair, tentative, self._seed)]
+            flats = [*planes(self._pair, tentative, self._seed)]
         epipolar = None if epipolar is None or epipolar.log10_nfa >= limit else epipolar
         flats = [each for each in flats if each.log10_nfa < limit]
         flat: Layer | None = None
         tracks: PlaneTracks | None = None
         refuting: list[Layer] = []
         for plane in flats:
-            layer = self._seen_plane(pair, judge, plane, epipolar, free)
+            layer = self._seen_plane(plane, epipolar, free)
             own, tracks = layer.hypothesis, layer.tracks
             self.best_nfa = min(self.best_nfa, own.log10_nfa)
             clear = free is None and _mostly(own.inliers, np.ones_like(own.inliers), MIN_CHOSEN)
@@ -199,19 +200,19 @@ class Explanation:
             else:
                 flat = layer
                 break
-        part = None
-        if epipolar is not None and flat is not None:
-            least = 1 / 2 if flat.evidence.share >= NEARLY_ALL else MOST
-            part = None if _mostly(flat.hypothesis.inliers, epipolar.inliers, least) else flat
         if epipolar is not None and (
             _mostly(refuted, epipolar.inliers, 1 / 2) or _mostly(chance, epipolar.inliers, 1 / 3)
         ):
             epipolar = None  # it explains the same pattern, or what is seen at the borders
+        part = None
+        if epipolar is not None and flat is not None:
+            least = 1 / 2 if flat.evidence.share >= NEARLY_ALL else MOST
+            part = None if _mostly(flat.hypothesis.inliers, epipolar.inliers, least) else flat
         if epipolar is not None:
-            epipolar = self._apart(pair, flats, epipolar)
+            epipolar = self._apart(flats, epipolar)
             self.best_nfa = min(self.best_nfa, epipolar.log10_nfa)
             if tracks is not None:
-                epipolar = epipolar.refitted(pair, tracks.points)
+                epipolar = epipolar.refitted(self._pair, tracks.points)
         if flat is not None and len(flat.matches) < self._enough:
             flat = None
         if epipolar is not None:
@@ -221,11 +222,13 @@ class Explanation:
                 or flat is None
                 or (tracks and tracks.show_depth(flat.evidence.share < NEARLY_ALL, self._seed))
             ):
-                deep = self._along_rows(pair, judge, epipolar, best, free)
-            if deep and (best is None or 2 * deep.evidence.windows >= best.evidence.windows):
+                deep = self._along_rows(epipolar, best, free)
+            if deep and (best is None or _wins(deep, best)):
                 yield deep
             else:
                 sparse.append(self._sparse(epipolar))
+                if part and part.hypothesis.log10_nfa < epipolar.log10_nfa:
+                    part = None
         if flat is not None and part is None:
             yield flat
         nothing = free is None and flat is None and epipolar is None
@@ -235,14 +238,10 @@ class Explanation:
             yield min(sparse, key=lambda each: each.hypothesis.log10_nfa)
 
     def _seen_plane(
-        self,
-        pair: ImagePair,
-        judge: Judge,
-        plane: Hypothesis,
-        epipolar: Hypothesis | None,
-        free: np.ndarray | None,
+        self, plane: Hypothesis, epipolar: Hypothesis | None, free: np.ndarray | None
     ) -> Layer:
         """Return what a plane explains once it is exact."""
+        pair, judge = self._seen(plane.tentative.cross_modal)
         agreeing = plane.inliers if epipolar is None else plane.inliers | epipolar.inliers
         some = plane.tentative.chosen(agreeing)
         tracks = PlaneTracks(pair, plane.matrix, (some.points0, some.points1), free)
@@ -253,14 +252,12 @@ class Explanation:
             matches = match_along_plane(pair, self.pixels, exact.matrix, judge, evidence)
         return Layer(exact, matches, evidence, tracks, evidence.confirms and view.repeated)
 
-    def _apart(
-        self, pair: ImagePair, flats: Sequence[Hypothesis], epipolar: Hypothesis
-    ) -> Hypothesis:
+    def _apart(self, flats: Sequence[Hypothesis], epipolar: Hypothesis) -> Hypothesis:
         """Return the geometry of what is off a plane, if a plane moves on its own."""
         for plane in flats:
             tentative = plane.tentative
             off = plane.errors(tentative.points0, tentative.points1) > 2 * plane.threshold_px
-            rest = propose(pair, tentative.chosen(off), "fundamental", self._seed)
+            rest = propose(self._pair, tentative.chosen(off), "fundamental", self._seed)
             if rest is None or 3 * np.count_nonzero(rest.inliers) < np.count_nonzero(plane.inliers):
                 continue  # a post before a wall fits to many matrices
             inliers = np.zeros(len(off), bool)
@@ -272,14 +269,10 @@ class Explanation:
         return epipolar
 
     def _along_rows(
-        self,
-        pair: ImagePair,
-        judge: Judge,
-        epipolar: Hypothesis,
-        plane: Layer | None,
-        free: np.ndarray | None,
+        self, epipolar: Hypothesis, plane: Layer | None, free: np.ndarray | None
     ) -> Layer | None:
         """Match along epipolar lines, also in images that a plane makes alike; None if rejected."""
+        pair, judge = self._seen(epipolar.tentative.cross_modal)
         count, lattice = len(self.pixels[0]), judge.lattice()
         everywhere = np.concatenate([self.pixels[0], lattice])
         known = None if plane is None else plane.hypothesis.matrix
@@ -441,6 +434,13 @@ def _copies(plane: Layer, other: Layer) -> bool:
     least = np.count_nonzero(plane.evidence.explained) / 2
     fewer = plane.evidence.windows <= other.evidence.windows
     return bool(fewer and np.count_nonzero(both) >= least)
+
+
+def _wins(deep: Layer, plane: Layer) -> bool:
+    """Return whether depth explains half of what a plane does, or most that both compare."""
+    compared = plane.evidence.explained & np.isfinite(deep.evidence.similarity)
+    kept = compared.any() and _mostly(compared & deep.evidence.explained, compared, MIN_KEPT)
+    return bool(kept) or deep.evidence.windows >= plane.evidence.windows / 2
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
