@@ -227,8 +227,6 @@ class Explanation:
                 yield deep
             else:
                 sparse.append(self._sparse(epipolar))
-                if part and part.hypothesis.log10_nfa < epipolar.log10_nfa:
-                    part = None
         if flat is not None and part is None:
             yield flat
         nothing = free is None and flat is None and epipolar is None
