@@ -377,7 +377,8 @@ class Explanation:
         if own.model == "homography" and stands_still(own.matrix, self._pair.sizes):
             unlike |= seen.agreement < NEARLY_ALL  # as behind an overlay
         strong = seen.share >= least and own.log10_nfa < HIGH_LOG10_NFA
-        return layer.evidence.confirms and strong and not (layer.repeated or unlike)
+        before = layer.tracks is not None and layer.tracks.show_depth(True, self._seed)
+        return seen.confirms and strong and not (layer.repeated or unlike or before)
 
     def _with_scene(
         self, geometry: TwoViewGeometry, points0: np.ndarray, points1: np.ndarray
