@@ -24,7 +24,9 @@ FILES_OF_PAIRS = (
 
 NUMBERS = r"([-+.\deE \t;,\[\]]+)\r?$"
 COLMAP_LINE = re.compile(rf"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]{NUMBERS}", re.MULTILINE)
-DSO_FILE = re.compile(rf"^(?:(\w+)[ \t]+)?{NUMBERS}\n[ \t]*(\d+[ \t]+\d+)[ \t\r]*$", re.MULTILINE)
+DSO_FILE = re.compile(
+    rf"^(?:([A-Za-z]\w*)[ \t]+)?{NUMBERS}\n[ \t]*(\d+[ \t]+\d+)[ \t\r]*$", re.MULTILINE
+)
 TEXT_LINE = re.compile(r"(\[?)([^]:=[]*[A-Za-z][^]:=[]*)\]?(?:([:=])\s*(.*))?")
 
 OWN_KEYS = (
@@ -87,7 +89,7 @@ def _parsed(content: bytes) -> Values:
     if cameras := COLMAP_LINE.findall(text):
         return {"COLMAP": cameras}
     if (match := DSO_FILE.match(lines)) and len(numbers_in(match[2])) > 4:
-        return {"DSO": [match[1] or "fov", match[2], match[3]]}
+        return {"DSO": [*match.groups()]}
     try:
         values = json.loads(text) if text[:1] in ("{", "[") else None
     except ValueError:
@@ -132,7 +134,7 @@ def _text(lines: str) -> Values:
     """Parse lines "name = value" or "name: value", under [sections], or numbers under a name."""
     values: dict[str, Any] = {}
     section, name = values, ""
-    for line in map(str.strip, lines.splitlines()):
+    for line in map(str.strip, re.split(r"\n|[,;](?=\s*[A-Za-z]\w*\s*[:=])", lines)):
         if numbers := numbers_in(line):
             if name:
                 section[name] = [*section.get(name, []), *numbers]
@@ -167,7 +169,8 @@ def _xml_values(node: ElementTree.Element) -> Any:
 
 def _calib_json(values: Values, image: Pair) -> dict[str, Any]:
     sides = [each for key in ("left", "right") if isinstance(each := values.get(key), Mapping)]
-    if not values or any({"focal_px", "baseline_mm"} & {*each} for each in (values, *sides)):
+    keys = {key for each in (values, *sides) for key in each}
+    if "focal_px" in keys or ("baseline_mm" in keys and keys <= {*OWN_KEYS}) or not values:
         for key, value in [item for each in (values, *sides) for item in each.items()]:
             if key not in OWN_KEYS and not isinstance(value, Mapping) and any(numbers_in(value)):
                 known = ", ".join(OWN_KEYS)

@@ -37,6 +37,7 @@ MIN_FOCAL = 0.1
 """A focal length under this fraction of the image's longer side is rejected as not being in pixels,
 because the pinhole camera would have a field of view above 157 degrees."""
 
+MATRIX_SIZE = 9
 MATRIX = r"(?:new|color|rgb|cam(?:era)?)*(?:intrinsics?)?(?:matrix|mtx)|intrinsics?|cam|[km]"
 PROJECTION = r"p|projection(?:matrix)?"
 SIDES = ("left", "right"), ("l", "r"), ("1", "2"), ("0", "1")
@@ -55,14 +56,14 @@ SIZE_NAMES = {name for names in SIZES for name in names}
 MODELS = re.compile(r"(distortion)?(model|type)|modeltype|projection(type)?|poly.*name")
 NO_PINHOLES = re.compile(
     r"fisheye|equi|spheric|cylind|omni|kannala|theta|panoram|unified|eucm|double|dual|division|"
-    r"atan|orthogr|\b(ds|mei|fov|rpc)\b",
+    r"atan|orthogr|\b(ds|mei|fov|rpc|kb\d?)\b",
     re.IGNORECASE,
 )
 """Camera models with one of these words in their name are refused, even without distortion."""
 
 DISTORTIONS = re.compile(
-    r"(?!num).*(distortion|disto[^r]|distcoef).*|dist|coeffs?|coefficients|[kpsd]\d|b2|skew|d|kc|xi|"
-    "omega"
+    r"(?!num).*(distortion|disto(?!r)|dist(coef|param)|radial|tangential|kappa).*|(open|cv|rad)*dist|"
+    r"coef\w*|[kpsd]\d|b2|skew|d|kc|xi|omega"
 )
 CROPS = re.compile(r"[xy]_offset|binning_[xy]")
 BASELINES = re.compile(
@@ -185,22 +186,27 @@ def check_pinhole(values: Values) -> None:
             raise ReconstructionError(
                 f"it has a camera that is no pinhole ({key} {value!r}): undistort the images"
             )
-        if not (DISTORTIONS.fullmatch(name) or CROPS.fullmatch(str(key))):
+        if key not in ("k", "p") and not DISTORTIONS.fullmatch(name):
             continue
         numbers = numbers_in(value)
-        if CROPS.fullmatch(str(key)):
-            if any(number > str(key).startswith("binning") for number in numbers):
-                raise ReconstructionError(
-                    f"it is for a part or a smaller copy of the camera's images ({key} {value}): "
-                    "give the calibration of these images"
-                )
-            continue
         name = name if len(numbers) == 1 else name.rstrip("0123456789")  # K1 may be a matrix
-        if DISTORTIONS.fullmatch(name) and not all(abs(number) <= ROUNDING for number in numbers):
+        lens = DISTORTIONS.fullmatch(name) or (name in ("k", "p") and len(numbers) < MATRIX_SIZE)
+        if lens and not all(abs(number) <= ROUNDING for number in numbers):
             raise ReconstructionError(
                 f"it has distortion ({key} {', '.join(f'{n:g}' for n in numbers)}), which is not "
                 "supported: undistort the images, for example with cv2.undistort, and give the "
                 "camera matrix without coefficients"
+            )
+
+
+def check_whole(values: Values) -> None:
+    """Raise an error if a value says that the camera's images are cropped or smaller."""
+    for key, value in values.items():
+        least = str(key).startswith("binning")
+        if CROPS.fullmatch(str(key)) and any(number > least for number in numbers_in(value)):
+            raise ReconstructionError(
+                f"it is for a part or a smaller copy of the camera's images ({key} {value}): "
+                "give the calibration of these images"
             )
 
 
@@ -294,6 +300,7 @@ def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
     for name, each in objects_in(values):
         rectified = [matrix for matrix in matrices(each, PROJECTION, 12) if matrix[0, 0] > 0]
         both = rectified or matrices(each, MATRIX, 9, 12, 16)
+        check_whole(each)
         try:
             check_pinhole(each)
         except ReconstructionError:
@@ -355,9 +362,13 @@ def colmap(values: Values, image: Pair) -> Any:
 
 
 def dso(values: Values, image: Pair) -> Values:
-    """Read camera.txt of DSO and LSD-SLAM; numbers under 1 are fractions of width and height."""
+    """Read camera.txt of DSO and LSD-SLAM; numbers under 1 are fractions of width and height.
+
+    Without a model's name, a single further number is that of a fisheye, unless it is 0.
+    """
     model, numbers, sides = values["DSO"]
     size, camera, more = numbers_in(sides), numbers_in(numbers)[:4], numbers_in(numbers)[4:]
+    model = model or ("fov" if len(more) == 1 and more[0] else "pinhole")
     if max(camera[2:]) < 1:
         camera = (np.array(camera) * (*size, *size) - (0, 0, 0.5, 0.5)).tolist()
     return {"model": model, "intrinsics": camera, "coefficients": more, "resolution": size}
@@ -402,6 +413,7 @@ def orb_slam(values: Values, image: Pair) -> Any:
     found, stereo = found or [dict(shared)], values.get("Stereo", {})
     if not {"fx", "type", "model", "bf"} & {*found[0]}:
         return None
+    check_pinhole(found[0])
     metres = float(shared.get("bf", shared.get("focal_x_baseline", 0))) / float(found[0]["fx"])
     metres = metres or float(stereo.get("b", 0))
     metres = metres or math.hypot(*numbers_in(stereo.get("T_c1_c2"))[3:12:4])
@@ -419,8 +431,10 @@ def zed(values: Values, image: Pair) -> Values:
         raise ReconstructionError(
             f"it has no section for this size of images, only for {known}: resize the images"
         )
-    both = (values[f"{side}_CAM_{name}"] for side in ("LEFT", "RIGHT"))
-    left, right = ({**each, "resolution": sizes[name]} for each in both)
+    left, right = (
+        {**values.get(f"{side}_DISTO", {}), **values[f"{side}_CAM_{name}"], "resolution": size}
+        for side, size in (("LEFT", sizes[name]), ("RIGHT", sizes[name]))
+    )
     return {"left": left, "right": right, "baseline_mm": values["STEREO"]["Baseline"]}
 
 

@@ -121,11 +121,11 @@ def _mask_of(stored: list[Any], page: Any) -> np.ndarray | None:
     return None if found is None else np.asarray(found.asarray() != 0)
 
 
-def page_numbers(source: Any) -> list[int]:
+def page_numbers(source: Any, frames: bool = False) -> list[int]:
     """Return the numbers, from 0, of the images in a file: values of `page` in `load_image`.
 
     Images at most half as wide or high as the largest do not count: previews, gain maps, and the
-    levels of a pyramid.
+    levels of a pyramid. As `frames` of a video, channels, and frames of several slices, are errors.
     """
     from tifffile import TiffFile
 
@@ -133,6 +133,13 @@ def page_numbers(source: Any) -> list[int]:
         if file.read(4) in TIFF_STARTS:
             file.seek(0)
             with TiffFile(file, name="image.tif") as tiff:
+                stack = zip(tiff.series[0].axes, tiff.series[0].shape, strict=True)
+                axes = {axis: count for axis, count in stack if axis not in "YXS" and count > 1}
+                if frames and (len(axes) > 1 or "C" in axes):
+                    text = " x ".join(f"{count} ({axis})" for axis, count in axes.items())
+                    raise ImageError(
+                        f"{name} has {text} images: give those of one channel and slice"
+                    )
                 sizes = [(each.imagewidth, each.imagelength) for each in whole_pages([*tiff.pages])]
         else:
             with identify(file, name) as image:

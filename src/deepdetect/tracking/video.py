@@ -34,9 +34,10 @@ FOLDER_FPS = 10.0
 MAX_FPS = 1000.0
 """If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
-FIRST_FRAMES = 25
-"""This number of frames are compared. If all are really equal, so are some of their packets, since
-counters in H.264 headers restart after 16 frames, and MPEG's groups of pictures after 12 to 15."""
+EQUAL_FRAMES, DOUBTFUL_FRAMES = 24, 4
+"""If as many frames as EQUAL_FRAMES are really equal to the one before, so are some of their
+packets, since counters in H.264 headers restart after 16 frames, and MPEG's groups of pictures
+after 12 to 15. DOUBTFUL_FRAMES whose packets are all different are told."""
 
 SINGLE = "has a single frame: give a video, or a folder of frames"
 
@@ -96,7 +97,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         if not self.live and path.is_dir():
             self._images = [(each, None) for each in find_images(path)]
         elif not self.live and path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
-            self._images = [(path, page) for page in page_numbers(path)]
+            self._images = [(path, page) for page in page_numbers(path, frames=True)]
         else:
             self._capture = self._opened(str(source))
             stated = float(self._capture.get(cv2.CAP_PROP_FPS))
@@ -155,7 +156,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             raise BatchError(f"none of {count} frames can be read", self.failures)
 
     def _from_capture(self) -> Iterator[Frame]:
-        first = np.empty(0)
+        last, equal, packets = np.empty(0), 0, _Packets(self.path)
         for number in count():
             wanted = number % self.every == 0
             # `grab` skips a frame without decoding it, if the format allows it.
@@ -164,45 +165,72 @@ class FrameSource(AbstractContextManager["FrameSource"]):
                 break
             if wanted:
                 rgb = load_image(bgr, channels="bgr")
-                first = rgb if number == 0 else first
-                if number == self.every and not self.live and np.array_equal(rgb, first):
-                    _check_decoded(self.path)
+                same = not self.live and np.array_equal(rgb, last)
+                equal, last = equal + 1 if same else 0, rgb
+                if same:
+                    packets.compare(number, equal, rgb.size)
+                    packets.check(equal, min(EQUAL_FRAMES, (self.count or number + 2) - 1))
+                else:
+                    packets.end()
                 yield Frame(number, rgb)
         if number == 0:
             raise DeepDetectError("the source has no frames: check it with another program")
         if number == 1:
             raise DeepDetectError(f"{self.path} {SINGLE}")
+        if equal and equal == (number - 1) // self.every:
+            packets.check(equal, equal)
+        packets.end()
 
     def __exit__(self, *_: object) -> None:
         if self._capture is not None:
             self._capture.release()
 
 
-def _check_decoded(path: Path) -> None:
-    """Warn if the first frames of a video are all equal; raise an error if they should not be.
+class _Packets:
+    """The packets of a video, which tell whether equal frames should be equal.
 
     The conversion of interlaced frames fails in OpenCV 4.14 and 5.0, which then return the previous
     contents of the memory. If the frames of a video are really equal, some of its packets are
     equal, or packets only state that nothing changes.
     """
 
-    def first(video: Any) -> list[tuple[int, int]]:
-        found = (video.retrieve()[1] for _ in range(FIRST_FRAMES) if video.grab())
-        return [(hash(each.tobytes()), each.size) for each in found]
+    def __init__(self, path: Path) -> None:
+        self._path, self._video, self._read = path, None, 0
+        self._different: set[int] = set()
+        self._text, self._told = "", False
 
-    packets, frames = first(_undecoded(path)), first(cv2.VideoCapture(str(path)))
-    if len({*frames}) > 1:
-        return
-    text = f"the first {len(frames)} frames of {path} are equal"
-    # An encoder spends one bit on an unchanged block of 16x16 pixels; headers, up to 100 bytes.
-    unchanged = frames[0][1] / 3 / 16**2 / 8 + 100
-    differ = packets and len({*packets}) == len(packets)
-    if differ and np.median([size for _, size in packets]) > unchanged:
-        raise InvalidFileError(
-            f"{text}, but should not be: the installed OpenCV may fail with interlaced videos; "
-            f'convert the video, such as by ffmpeg -i "{path}" -vf yadif progressive.mp4'
-        )
-    warnings.warn(f"{text}: check that nothing moves in them", UserWarning, stacklevel=2)
+    def compare(self, number: int, equal: int, size: int) -> None:
+        """Read the packet of the last of `equal` frames that repeat the `size` values before."""
+        self._video = self._video or _undecoded(self._path)
+        for _ in range(self._read, number):
+            self._video.grab()
+        packet, self._read = self._video.read()[1], number + 1
+        # An encoder spends one bit on an unchanged block of 16x16 pixels; headers, up to 100 bytes.
+        if packet is not None and packet.size > size / 3 / 16**2 / 8 + 100:
+            self._different.add(hash(packet.tobytes()))
+        self._text = f"{equal + 1} frames of {self._path}, up to number {number}, are equal"
+
+    def check(self, equal: int, least: int) -> None:
+        """Raise an error if `least` equal frames should not be; warn if they may be."""
+        if len(self._different) >= least:
+            raise InvalidFileError(
+                f"{self._text}, but should not be: the installed OpenCV may fail with interlaced "
+                f'videos; convert it, such as by ffmpeg -i "{self._path}" -vf yadif progressive.mp4'
+            )
+        if equal >= least:
+            self._tell()
+
+    def end(self) -> None:
+        """Warn if equal frames that have ended may not be equal."""
+        if len(self._different) >= DOUBTFUL_FRAMES:
+            self._tell()
+        self._different.clear()
+
+    def _tell(self) -> None:
+        if not self._told:
+            text = f"{self._text}: check that nothing moves in them"
+            warnings.warn(text, UserWarning, stacklevel=2)
+        self._told = True
 
 
 def _camera_number(source: str | Path | int) -> int | None:
