@@ -14,9 +14,10 @@ LITTLE_RANGE = 1 / 8
 """An image that uses less than this fraction of its range causes a warning, because few grey levels
 are left of it. Chosen by hand."""
 
-MAX_OUTLIERS = 1e-3
-"""This share of the pixels may lie outside the range, because sensors have hot and dead pixels: up
-to one in a thousand. Chosen by hand."""
+MAX_OUTLIERS, FEW = 1e-3, 1e-2
+"""The share MAX_OUTLIERS of the pixels may lie outside the range, because sensors have hot and dead
+pixels: up to one in a thousand. An image whose other pixels, without the share FEW at either end (a
+flame, the sun), use little of the range causes a warning. Chosen by hand."""
 
 ValueRange = tuple[float, float]
 
@@ -29,6 +30,7 @@ def range_of_uint16(array: np.ndarray, name: str, call: ValueRange | None) -> Va
     counts = counts_of(array)
     if call is None:
         return find_range(counts, name)
+    _tell_of_counts(counts, call, name)
     low, high = map(round, call)
     outside = (counts[1 : max(1, low)].sum() + counts[high + 1 : -1].sum()) / counts.sum()
     if outside > MAX_OUTLIERS:
@@ -63,7 +65,7 @@ def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
     if counts[white + 1 : 2 * white + 2].any() or (padded and white < 256):
         white, high = full, 65535 if padded else high
     if name is not None:
-        _tell_if_little(low, high, white, name)
+        _tell_of_counts(counts, (0, white), name)
     width = high - low
     if not 0 < width < min(low, LITTLE_RANGE * white):
         return 0, white
@@ -78,8 +80,14 @@ def tell_if_little(values: np.ndarray, white: float, name: str) -> None:
     seen = values[::step, ::step]
     seen = seen[(seen > 0) & (seen < white)]  # the ends may be padding
     if len(seen):
-        low, high = np.quantile(seen.astype(np.float64), (MAX_OUTLIERS, 1 - MAX_OUTLIERS))
+        low, high = np.quantile(seen.astype(np.float64), (FEW, 1 - FEW))
         _tell_if_little(float(low), float(high), white, name)
+
+
+def _tell_of_counts(counts: np.ndarray, limits: ValueRange, name: str) -> None:
+    total = np.cumsum(np.r_[0, counts[1:-1]])  # the ends may be padding
+    low, high = np.searchsorted(total, np.array([FEW, 1 - FEW]) * total[-1]) - limits[0]
+    _tell_if_little(float(low), float(high), limits[1] - limits[0], name)
 
 
 def _tell_if_little(low: float, high: float, white: float, name: str) -> None:

@@ -307,7 +307,11 @@ def require_pinholes(model: Any) -> None:
         if not suspects:
             return
         adjust(fitted, False, ROUGH_TOLERANCE)
-        costs.append({n: np.log1p(point.error**2) for n, point in fitted.points3D.items()})
+        # A few wrong points have errors of any size.
+        errors = {
+            n: min(each.error, MAX_VERIFICATION_ERROR_PX) for n, each in fitted.points3D.items()
+        }
+        costs.append({n: np.log1p(error**2) for n, error in errors.items()})
     common = costs[0].keys() & costs[1].keys()
     pinhole, fisheye = (np.array([each[n] for n in common]) for each in costs)
     if deviations(pinhole, fisheye) > MIN_DEVIATIONS:

@@ -200,10 +200,9 @@ class Explanation:
             else:
                 flat = layer
                 break
-        if epipolar is not None and (
-            _mostly(refuted, epipolar.inliers, 1 / 2) or _mostly(chance, epipolar.inliers, 1 / 3)
-        ):
-            epipolar = None  # it explains the same pattern, or what is seen at the borders
+        if epipolar is not None and _mostly(chance, epipolar.inliers, 1 / 3):
+            epipolar = None  # it explains what is seen at the borders
+        pattern = epipolar is not None and _mostly(refuted, epipolar.inliers, 1 / 2)
         part = None
         if epipolar is not None and flat is not None:
             least = 1 / 2 if flat.evidence.share >= NEARLY_ALL else MOST
@@ -217,19 +216,22 @@ class Explanation:
             flat = None
         if epipolar is not None:
             deep, best = None, part or flat
+            foreground = flat is not None and flat.evidence.share < NEARLY_ALL
             if (
                 part
-                or flat is None
-                or (tracks and tracks.show_depth(flat.evidence.share < NEARLY_ALL, self._seed))
+                or (flat is None and not pattern)
+                or (tracks and tracks.show_depth(foreground, self._seed))
             ):
                 deep = self._along_rows(epipolar, best, free)
+            if deep and any(_copies(deep, each) for each in refuting):
+                deep, pattern = None, True
             if deep and (best is None or _wins(deep, best)):
                 yield deep
-            else:
+            elif not pattern:
                 sparse.append(self._sparse(epipolar))
         if flat is not None and part is None:
             yield flat
-        nothing = free is None and flat is None and epipolar is None
+        nothing = free is None and flat is None and (epipolar is None or pattern)
         self.refuted = nothing and surely
         sparse = [each for each in sparse if self._suffices(each)]
         if sparse and free is None and not (nothing and refuted.any()):
@@ -333,7 +335,7 @@ class Explanation:
             return TwoViewGeometry("none", evidence=evidence), None
         first = self.layers[0]
         own = first.hypothesis
-        if self._asked != "homography" and len(self.layers) == 1:  # two motions pass for a lens
+        if self._asked != "homography":
             straight_lines(self._pair, own)
         matches = first.matches
         for layer in self.layers[1:]:
