@@ -335,7 +335,8 @@ class Explanation:
             return TwoViewGeometry("none", evidence=evidence), None
         first = self.layers[0]
         own = first.hypothesis
-        if self._asked != "homography":
+        planes_move = own.model == "homography" and len(self.layers) > 1  # which passes for a lens
+        if self._asked != "homography" and not planes_move:
             straight_lines(self._pair, own)
         matches = first.matches
         for layer in self.layers[1:]:
