@@ -70,6 +70,18 @@ def test_an_overlay_is_found_and_little_else(drawn, facade, photo: np.ndarray) -
     assert not (found & ~around).any()
 
 
+def test_an_overlay_is_found_although_the_scene_moves_little_at_half_of_it(photo) -> None:
+    # A camera drives forward: around the point it drives to, below the middle, nothing moves.
+    scene = cv2.resize(skimage.data.astronaut(), (640, 480), interpolation=cv2.INTER_AREA)
+    ahead = cv2.getRotationMatrix2D((320, 400), 0, 1.03)
+    views = [scene, cv2.warpAffine(scene, ahead, (640, 480), flags=cv2.INTER_CUBIC)]
+    assert not find_overlay([gray(compressed(view)) for view in views]).any()
+    masks = [bonnet(view, photo) for view in views]
+    found = find_overlay([gray(compressed(view)) for view in views])
+    assert found[masks[0] & masks[1]].mean() > 0.6
+    assert found[~masks[0]].mean() < 0.25  # of it, much is plain
+
+
 def test_a_scene_without_an_overlay_has_none(facade) -> None:
     scene = facade(0.3)
     assert not find_overlay([gray(scene.left), gray(scene.right)]).any()
