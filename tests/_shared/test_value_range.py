@@ -96,6 +96,19 @@ def test_what_does_not_fit_the_range_of_a_folder_is_told(tmp_path: Path) -> None
             load_image(paths[1])
 
 
+@pytest.mark.parametrize("share", [0.005, 0.03])
+def test_a_flame_that_leaves_few_levels_to_the_rest_is_told(share: float) -> None:
+    cool = RNG.integers(7000, 7400, (100, 120)).astype(np.uint16)
+    flame = cool.copy()
+    flame[: round(100 * share**0.5), : round(120 * share**0.5)] = 16000
+    with warnings.catch_warnings(record=True):
+        warnings.simplefilter("always")
+        with one_range([cool, flame]) as reading:
+            pass
+    with read_with(reading), pytest.warns(UserWarning, match="value_range"):
+        assert len(np.unique(load_image(cool))) < 16
+
+
 def test_images_of_8_bits_have_no_common_range() -> None:
     small = RNG.integers(0, 256, (100, 120)).astype(np.uint8)
     with one_range([small, small]) as reading:

@@ -226,6 +226,7 @@ SINGLE: dict[str, Any] = {
     "TOML": "[camera]\nfx = 500\nfy = 502.0\ncx = 310.5\ncy = 242.25\nname = 'left'\n",
     "lines": "fx=500\nfy=502\ncx=310.5\ncy=242.25\n",
     "XML": "<camera><fx>500</fx><fy>502</fy><cx>310.5</cx><cy>242.25</cy></camera>",
+    "names on one line": "fx=500, fy=502, cx=310.5, cy=242.25\n",
     "a line": "500 502 310.5 242.25\n",
     "a line with a comment": "# fx fy cx cy\n500, 502, 310.5, 242.25",
     "a line of TUM": "500 502 310.5 242.25 0 0 0 0\n",
@@ -314,6 +315,8 @@ DISTORTED: dict[str, tuple[Any, str]] = {
     "stella_vslam": ({"Camera": {**STELLA, "k1": -0.1}}, "stella_vslam"),
     "stella_vslam, panorama": ({"Camera": {"model": "equirectangular", **SIDES}}, "stella_vslam"),
     "ZED": (ZED.replace("k1=0", "k1=-0.17"), "ZED"),
+    "ZED X": (ZED + "[LEFT_DISTO]\nk1=-1.2\n[RIGHT_DISTO]\nk1=-1.2\n", "ZED"),
+    "LSD-SLAM by OpenCV": ("500 502 310.5 242.25 -0.28 0 0 0\n640 480\ncrop\n640 480\n", "-0.28"),
     "RealSense": ({**REALSENSE, "coeffs": [-0.05, 0.06, 0, 0, 0]}, "RealSense"),
     "RealSense, fisheye": ({**REALSENSE, "model": "distortion.kannala_brandt4"}, "RealSense"),
     "DepthAI": (depthai(distortionCoeff=[0.1] * 14), "DepthAI"),
@@ -344,6 +347,15 @@ DISTORTED: dict[str, tuple[Any, str]] = {
     "VINS-Fusion": (VINS.replace("k1: 0.0", "k1: -0.3"), "k1|dist"),
     "Basalt": ({"value0": {"intrinsics": [{"camera_type": "ds", "intrinsics": ROW}]}}, "ds"),
     "JSON": ({**ROW, "k1": -0.1}, "k1"),
+    "Basalt, Kannala-Brandt": (
+        {"value0": {"intrinsics": [{"camera_type": "kb4", "intrinsics": {**ROW, **ZEROS}}]}},
+        "kb4",
+    ),
+    "OpenVSLAM, panorama": (flat("Camera", {**SIDES, "model": "equirectangular"}), "equirect"),
+    **{
+        f"JSON, {name}": ({**ROW, name: [-0.28, 0.07]}, name)
+        for name in ("k", "radial", "disto", "dist_params", "rad_dist", "kappa", "coef")
+    },
     "JSON, beside": ({"camera": ROW, "distortion": {"k1": -0.1}}, "dist"),
     "a line of TUM": ("500 502 310.5 242.25 0.26 -0.95 -0.005 0.002 1.16", "0.26"),
     "a matrix with skew": ("500 3 310.5\n0 502 242.25\n0 0 1\n", "skew"),
@@ -358,6 +370,14 @@ def test_distortion_is_refused_with_the_name_of_the_format(name: str, tmp_path: 
 
 
 REFUSED: dict[str, tuple[Any, str]] = {
+    "a smaller copy": (
+        {
+            "distortion_model": "plumb_bob",
+            "binning_x": 2,
+            "P": [FX, 0, CX, 0, 0, FY, CY, *[0] * 3, 1, 0],
+        },
+        "binning_x",
+    ),
     "a pose": ("0.36 0.48 -0.8\n-0.8 0.6 0\n0.48 0.64 0.6\n", "matrix"),
     "last row": ("500 0 310.5\n0 502 242.25\n0 0 2\n", "0 0 2"),
     "a homography": ('{"K": [[1, 0.1, 3], [0.2, 1, 5], [1e-4, 0, 1]]}', "matrix"),
@@ -474,6 +494,8 @@ OTHERS: dict[str, Any] = {
     "MVSNet": "extrinsic\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n\n"
     "intrinsic\n500 0 310.5\n0 502 242.25\n0 0 1\n\n425 2.5\n",
     "DSO": "Pinhole 500 502 310.5 242.25 0\n640 480\nnone\n640 480\n",
+    "LSD-SLAM by OpenCV": "500 502 310.5 242.25 0 0 0 0\n640 480\ncrop\n640 480\n",
+    "LSD-SLAM, pinhole": "500 502 310.5 242.25 0\n640 480\nnone\n640 480\n",
     "DSO, fractions": f"RadTan {FX / 640} {FY / 480} {311 / 640} {242.75 / 480} 0 0 0 0\n"
     "640 480\ncrop\n640 480\n",
     "vikit": "cam_model: Pinhole\n"
@@ -503,6 +525,7 @@ MOVED = np.eye(4)
 MOVED[0, 3] = 0.12
 PAIRS: dict[str, Any] = {
     "baseline_mm": {**PAIR, "stereo": {"baseline_mm": 120}},
+    "baseline_mm beside": {**PAIR, "baseline_mm": 120},
     "baseline in m": {**PAIR, "baseline_m": 0.12},
     "baseline_cm": {**PAIR, "baseline_cm": 12},
     "baseline under 1": {**PAIR, "baseline": 0.12},

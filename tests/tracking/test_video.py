@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import itertools
 import re
 import signal
+import warnings
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -69,6 +71,12 @@ def test_the_pages_of_an_image_file_are_frames(moving_photo, tmp_path: Path) -> 
             assert source.count == 2
             for frame in source:
                 np.testing.assert_array_equal(frame.rgb, frames[frame.number])
+    for name, axes in (("channels.tif", "TCYX"), ("slices.ome.tif", "TZYX")):
+        both = np.stack([np.stack([frame[..., k] for frame in frames]) for k in (0, 1)], axis=1)
+        own = {"ome": True} if "ome" in name else {"imagej": True}
+        tifffile.imwrite(tmp_path / name, both, metadata={"axes": axes}, **own)
+        with pytest.raises(ImageError, match=r"\(T\)"):
+            FrameSource(tmp_path / name)
     with tifffile.TiffWriter(tmp_path / "pyramid.tif") as writer:
         for step in (1, 2, 4):
             writer.write(frames[0][::step, ::step].copy(), photometric="rgb")
@@ -132,6 +140,29 @@ def test_packets_that_change_nothing_may_differ(moving_photo, tmp_path: Path) ->
     writer.release()
     with FrameSource(path) as source, pytest.warns(UserWarning, match="moves"):
         assert len(list(source)) == 8
+
+
+def test_frames_that_repeat_later_are_told(moving_photo, tmp_path: Path) -> None:
+    shape, code = moving_photo(0).shape[1::-1], cv2.VideoWriter_fourcc(*"mpg2")
+    for name in ("plain.mpg", "interlaced.mpg"):
+        writer = cv2.VideoWriter(str(tmp_path / name), cv2.CAP_FFMPEG, code, 25, shape)
+        if not writer.isOpened():
+            pytest.skip("the installed OpenCV does not write MPEG-2")
+        for k in range(12):
+            writer.write(moving_photo(k)[..., ::-1].copy())
+        writer.release()
+    first, second = ((tmp_path / name).read_bytes() for name in ("plain.mpg", "interlaced.mpg"))
+    path = tmp_path / "both.mpg"
+    path.write_bytes(first + interlaced(second))
+    frames: list[np.ndarray] = []
+    with FrameSource(path) as source, warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            frames += [frame.rgb for frame in source]
+        except InvalidFileError:
+            return
+    repeated = sum(np.array_equal(*two) for two in itertools.pairwise(frames))
+    assert len(told) == (repeated >= 4)  # OpenCV 4.13 decodes them
 
 
 class Camera:

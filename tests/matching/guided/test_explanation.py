@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 import skimage.data
 
-from deepdetect import DeepDetect, Keypoints, PointDetector, estimate_geometry, match_images
+from deepdetect import (
+    DeepDetect,
+    ImageError,
+    Keypoints,
+    PointDetector,
+    estimate_geometry,
+    match_images,
+)
 from deepdetect.features.matches import GuidedMatches, TwoViewGeometry
 from deepdetect.geometry import transform_points
 from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
@@ -183,6 +190,26 @@ def test_of_two_motions_alike_in_size_neither_is_trusted_highly(photo: np.ndarra
         errors = transfer_errors(matches.points0, matches.points1, np.vstack([motion, [0, 0, 1]]))
         assert 0.33 < (errors < 1).mean() < 0.67
     assert matches.geometry.confidence == "fair"
+
+
+def turned_view(degrees: float, fisheye: bool) -> np.ndarray:
+    """A view of a room of photographs by a camera that turns in its middle."""
+    first, second = skimage.data.astronaut(), cv2.resize(skimage.data.coffee(), (512, 512))
+    room = np.hstack([first, second, first[:, ::-1]])
+    x, y = np.meshgrid(np.arange(640) - 319.5, np.arange(480) - 239.5)
+    radius = np.hypot(x, y)
+    angle = radius / 400 * np.radians(80) if fisheye else np.arctan(radius / 400)
+    rays = np.dstack([np.sin(angle) * x / radius, np.sin(angle) * y / radius, np.cos(angle)])
+    longitude = np.arctan2(rays[..., 0], rays[..., 2]) + np.radians(degrees)
+    latitude = np.arcsin(rays[..., 1])
+    places = (longitude / np.pi + 1) * 768, (latitude / np.pi + 0.5) * 512
+    return cv2.remap(room, *np.float32(places), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+
+
+def test_a_turned_camera_has_a_homography_unless_its_lens_is_a_fisheye() -> None:
+    assert match_images(turned_view(0, False), turned_view(12, False)).geometry.scene == "rotation"
+    with pytest.raises(ImageError):
+        match_images(turned_view(0, True), turned_view(12, True))
 
 
 def test_a_frame_that_stands_still_is_no_motion(photo: np.ndarray) -> None:
