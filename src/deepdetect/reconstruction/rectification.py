@@ -1,7 +1,7 @@
 """Recognise rectified pairs, and check that the calibration fits them and that they show depth.
 
 The matches of a rectified pair lie on the same row in both images. A pair is rectified if about as
-many matches do so as fit a fundamental matrix, or a model of shifted, tilted and scaled rows.
+many matches do so as fit a fundamental matrix.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ of the principal point) of both views by at most twice this. Chosen by hand."""
 
 MIN_INLIER_RATIO = 0.9
 """A pair is rectified only if its matches on the same row number at least this fraction of the
-inliers of the best fitted model. Chosen by hand."""
+inliers of a fundamental matrix. Chosen by hand."""
 
 MIN_DISPARITY_SPREAD_PX = 2.0
 """A pair is rectified only if its disparities spread by at least this from the 5th to the 95th
@@ -37,9 +37,6 @@ least this, as on a slanted plane. Small rotations of the camera spread disparit
 
 GRID_SIZE_PX = 8
 """One match is taken from each cell of the left image; cells have this side. Chosen by hand."""
-
-ITERATIONS = 500
-"""RANSAC in `_best_other_rows` draws this number of samples of three matches. Chosen by hand."""
 
 MIN_COARSE_INLIERS = 50
 """The coarse pass decides only if at least this number of matches fit a fundamental matrix."""
@@ -91,7 +88,6 @@ class Rectification:
         swapped: whether the pair is rectified, but left and right are exchanged.
         on_rows: number of `matches` whose rows in the two images differ by at most one pixel.
         by_fundamental: number of matches that a fundamental matrix explains with that tolerance.
-        by_other_rows: number of matches that fit rows that are shifted, tilted and scaled.
         matches: number of matches that were used, one per cell of the left image.
         vertical_offset: median of y in the second image minus y in the first, in pixels, of the
             matches that the fundamental matrix explains; NaN if there are none.
@@ -104,7 +100,6 @@ class Rectification:
     swapped: bool
     on_rows: int
     by_fundamental: int
-    by_other_rows: int
     matches: int
     vertical_offset: float
     disparities: tuple[float, float, float]
@@ -149,7 +144,7 @@ def _coarse_pass(
         limit = MAX_COARSE_ROW_ERROR_PX * scale
         decided = on_rows and _row_error(*matched, seed) < limit
     else:
-        best = max(found.by_fundamental, found.by_other_rows)
+        best = found.by_fundamental
         # Rejection needs a margin of three standard deviations of a binomial distribution.
         deviation = np.sqrt(best * MIN_INLIER_RATIO * (1 - MIN_INLIER_RATIO))
         decided = found.on_rows < MIN_INLIER_RATIO * best - 3 * deviation
@@ -195,16 +190,12 @@ def detect_rectification(
     on_rows = np.abs(second[:, 1] - first[:, 1]) <= limit
     # In a rectified pair, the Sampson distance is the difference of the rows divided by sqrt(2).
     epipolar = fit_model(first, second, "fundamental", size, limit / np.sqrt(2), seed)
-    other_rows = _best_other_rows(first, second, size, seed)
     disparity = (first - second)[on_rows, 0]
     spread = np.quantile(disparity, [0.05, 0.5, 0.95]) if len(disparity) else np.full(3, np.nan)
     vertical_offset = np.nan
     if epipolar.inliers.any():
         vertical_offset = float(np.median((second - first)[epipolar.inliers, 1]))
-    on_rows_count, by_fundamental, by_other_rows = (
-        int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers, other_rows)
-    )
-    best = max(by_fundamental, by_other_rows)
+    on_rows_count, best = (int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers))
     reason = ""
     # Rows have no fitted parameters, so the NFA (false alarms) of a fundamental matrix is stricter.
     if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
@@ -228,39 +219,11 @@ def detect_rectification(
         reason=reason,
         swapped=bool(not reason and spread[1] + offset_px < 0),
         on_rows=on_rows_count,
-        by_fundamental=by_fundamental,
-        by_other_rows=by_other_rows,
+        by_fundamental=best,
         matches=len(indices),
         vertical_offset=vertical_offset,
         disparities=(float(spread[0]), float(spread[1]), float(spread[2])),
     )
-
-
-def _best_other_rows(
-    points0: np.ndarray, points1: np.ndarray, size: tuple[int, int], seed: int
-) -> np.ndarray:
-    """Fit y1 - y0 as a linear function of x0 and y0 by RANSAC; return its (M,) bool inliers.
-
-    This model allows rows to be shifted, tilted and scaled. A sample has three matches instead of
-    the seven of a fundamental matrix, so more outliers are tolerated.
-    """
-    shift = points1[:, 1] - points0[:, 1]
-    best = np.zeros(len(points0), bool)
-    if len(points0) < 3:
-        return best
-    design = np.column_stack([points0 / max(size), np.ones(len(points0))])
-    samples = np.random.default_rng(seed).integers(0, len(points0), (ITERATIONS, 3))
-    samples = samples[np.abs(np.linalg.det(design[samples])) >= 1e-4]
-    planes = np.linalg.solve(design[samples], shift[samples][..., None])[..., 0]
-    agreeing = np.abs(planes @ design.T - shift) <= MAX_ROW_DISTANCE_PX
-    if agreeing.any():
-        best = agreeing[np.argmax(np.count_nonzero(agreeing, axis=1))]
-    if np.count_nonzero(best) >= 3:
-        plane = np.linalg.lstsq(design[best], shift[best], rcond=None)[0]
-        refined = np.abs(design @ plane - shift) <= MAX_ROW_DISTANCE_PX
-        if np.count_nonzero(refined) > np.count_nonzero(best):
-            best = refined
-    return best
 
 
 def check_cameras(calibration: Calibration) -> None:

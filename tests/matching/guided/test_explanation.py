@@ -276,6 +276,19 @@ def test_depth_explains_as_much_as_a_plane_that_is_a_part_of_it(shared: Path) ->
 
 
 @pytest.mark.slow
+def test_a_wall_that_repeats_hides_no_depth(shared: Path) -> None:
+    """Displaced copies of the brick wall behind this fountain explain it as well as it does."""
+    (scene,) = load_posed_scenes(shared / "data" / "fountain")
+    first, second = scene.images[8], scene.images[10]
+    matches = match(first.path, second.path)
+    errors = epipolar_errors(
+        matches.points0, matches.points1, PosedPair("fountain", first, second).fundamental
+    )
+    assert len(matches) > 50_000
+    assert (errors < 3).mean() > 0.99
+
+
+@pytest.mark.slow
 def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> None:
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
     detector = DeepDetect("dense")

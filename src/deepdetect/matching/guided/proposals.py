@@ -140,11 +140,7 @@ class Sources:
     @cached_property
     def learned(self) -> Tentative:
         """Matches of learned points of small copies."""
-        return self._matched(self._learned_points, LEARNED_SIDE_PX)
-
-    @cached_property
-    def _learned_points(self) -> tuple[Keypoints, Keypoints]:
-        return self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS)
+        return self._matched(self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS), LEARNED_SIDE_PX)
 
     def _extract(self, side_px: int, keypoints: int) -> tuple[Keypoints, Keypoints]:
         pair = self._pair
@@ -167,7 +163,9 @@ class Sources:
         views, _ = self._pair.both(LEARNED_SIDE_PX)
         described = [
             describe_learned(view, points, CROSS_MODAL)
-            for view, points in zip(views, self._learned_points, strict=True)
+            for view, points in zip(
+                views, self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS), strict=True
+            )
         ]
         found = self._matched((described[0], described[1]), LEARNED_SIDE_PX)
         return replace(found, cross_modal=True)
@@ -175,11 +173,7 @@ class Sources:
     @cached_property
     def dense(self) -> Tentative:
         """Matches of many learned points."""
-        return self._matched(self._dense_points, DENSE_SIDE_PX)
-
-    @cached_property
-    def _dense_points(self) -> tuple[Keypoints, Keypoints]:
-        return self._extract(DENSE_SIDE_PX, DENSE_KEYPOINTS)
+        return self._matched(self._extract(DENSE_SIDE_PX, DENSE_KEYPOINTS), DENSE_SIDE_PX)
 
     def _views(self) -> Tentative:
         views, (scale0, scale1) = self._pair.both(VIEWED_SIDE_PX)
@@ -198,7 +192,7 @@ class Sources:
         self, points: tuple[Keypoints, Keypoints], scale0: float, scale1: float
     ) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield matches of small copies of either image with large copies of the other."""
-        large0, large1 = self._dense_points
+        large0, large1 = self._extract(DENSE_SIDE_PX, DENSE_KEYPOINTS)
         dense0, dense1 = self._pair.both(DENSE_SIDE_PX)[1]
         first, second, ratios = matched_points(points[0], large1)
         yield first, scaled_points(second, scale1 / dense1), ratios
