@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import skimage.data
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngInfo
@@ -80,6 +81,36 @@ def test_noise_and_a_black_nadir_hide_no_panorama() -> None:
     assert edges_meet(made)
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("quality", "light", "noise"), [(75, 1, 0), (30, 1, 0), (92, 1, 5), (75, 0.2, 1)]
+)
+def test_neither_compression_nor_noise_nor_darkness_hides_a_panorama(
+    seed: int, quality: int, light: float, noise: float
+) -> None:
+    made = light * panorama(seed) + np.random.default_rng(seed).normal(
+        0, noise, (HEIGHT, 2 * HEIGHT)
+    )
+    file = cv2.imencode(
+        ".jpg", made.clip(0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
+    sphere = cv2.imdecode(file[1], cv2.IMREAD_GRAYSCALE)
+    assert edges_meet(sphere)
+    assert edges_meet(sphere[56:-56])  # a strip of 100 degrees
+    assert not edges_meet(sphere[:, :400][28:-28])
+
+
+@pytest.mark.parametrize("name", ["rocket", "coffee", "astronaut", "camera", "chelsea", "page"])
+def test_photographs_cut_to_2_to_1_are_no_panoramas(name: str) -> None:
+    rgb = getattr(skimage.data, name)()
+    gray = rgb if rgb.ndim == 2 else cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    height = min(len(gray), gray.shape[1] // 2)
+    assert not edges_meet(gray[:height])
+    assert not edges_meet(gray[-height // 2 :])
+    mirrored = np.hstack([gray[:height, ::-1], gray[:height]])  # so are its edges alike
+    assert not edges_meet(mirrored)
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_a_photograph_of_2_to_1_is_no_panorama(seed: int) -> None:
     assert not edges_meet(pinhole(seed))
@@ -116,6 +147,29 @@ def test_a_circular_fisheye_is_round(side: int, size: tuple[int, int], degrees: 
     with pytest.raises(ImageError, match="v360=fisheye"):
         load_pinhole(encoded(made), rim=True)
     np.testing.assert_array_equal(load_pinhole(made)[..., 0], made)
+
+
+@pytest.mark.parametrize("ground", [70, 128, 255])
+@pytest.mark.parametrize("quality", [75, 92])
+def test_a_circle_may_be_on_any_plain_ground(ground: int, quality: int) -> None:
+    made = fisheye(236, 170, (320, 240))
+    made = np.where(made == 3, ground, made.clip(20, 225)).astype(np.uint8)
+    file = cv2.imencode(".jpg", made, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    assert is_round(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE))
+
+
+def test_objects_on_a_bright_ground_are_not_round() -> None:
+    ground = np.full((240, 240), 200, np.uint8)
+    plate, shadow = ground.copy(), ground.copy()
+    cv2.circle(plate, (120, 120), 100, 60, -1)
+    cv2.circle(shadow, (120, 120), 112, 120, -1)
+    lit = cv2.GaussianBlur(shadow, (0, 0), 6)  # up to the image edges
+    cv2.circle(lit, (120, 120), 105, 240, -1)
+    far = np.hypot(*(np.indices((240, 240)) - 120)) / 120
+    vignetted = (230 / (1 + 0.4 * far**2) ** 2).astype(np.uint8)  # through a microscope
+    square = cv2.copyMakeBorder(ground[5:-5, 5:-5] // 2, 5, 5, 5, 5, cv2.BORDER_CONSTANT, value=255)
+    for made in (plate, lit, vignetted, square, skimage.data.coins(), skimage.data.moon()):
+        assert not is_round(made)
 
 
 @pytest.mark.parametrize("ground", [0, 30])

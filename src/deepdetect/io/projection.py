@@ -18,18 +18,17 @@ MIN_ASPECT, MAX_ASPECT = 1.95, 2.05
 """A panorama of 360 degrees is at least MIN_ASPECT times as wide as high. Up to MAX_ASPECT, it is
 equirectangular (2:1, with a margin for resizing); a wider one may be cylindrical."""
 
-ROWS, SHARPEST, FAR, MARGIN = 512, 0.003, (1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2), 1.5
-"""Left and right edges meet if they differ MARGIN times less than any two columns at the distances
-FAR (fractions of the width), and no more than neighbouring columns, except the fraction SHARPEST of
-these (outlines). FAR begins with 1/16, because most plain backgrounds, whose columns are all alike,
-are wider. About ROWS rows are compared, to save time. The ratio that MARGIN limits is at least 1.5
-for 6 panoramas, and at most 1.4 for 2,163 photographs cut to 2:1."""
+ROWS, DETAIL, FAR, MARGIN = 256, 31, 16, 1.3
+"""Left and right edges meet if, over ROWS rows less the mean of DETAIL of them, they differ MARGIN
+times less than either does from columns 1 / FAR of the width away, and than mirrored columns do.
+Chosen on 50 rendered rooms; of 60 others it misses 1.1 % (JPEG quality 30: none), and it refuses 1
+of 3,222 other photographs cut to 2:1 and wider (a banner, mirrored)."""
 
-SIDE_PX, BLACK, MAX_DARK, ROUNDNESS, MAX_CUT = 128, 16, 48, (0.97, 0.92), 16 / 9
-"""Fisheye circles are sought in images reduced to a shorter side of SIDE_PX. The corners have
-up to MAX_DARK grey levels (noise of cheap cameras), the circle over BLACK more (ITU-R BT.601). It
-fills ROUNDNESS[0] of a disc (an octagon fills 0.90), or ROUNDNESS[1] if two are side by side. Its
-diameter is 1 to MAX_CUT times the shorter side (a video of full width). Chosen by hand."""
+SIDE_PX, BLACK, PLAIN, RIM, MAX_DARK, ROUNDNESS, MAX_CUT = 128, 16, 8, 2, 48, (0.97, 0.92), 16 / 9
+"""Fisheye circles are sought in images reduced to a shorter side of SIDE_PX, over BLACK grey levels
+(ITU-R BT.601) off the corners: dark ones up to MAX_DARK (noise), or ones that vary by up to PLAIN,
+as does all over RIM px outside (no shadow). They fill ROUNDNESS[0] of a disc (an octagon: 0.90), or
+ROUNDNESS[1] if two are side by side, and are 1 to MAX_CUT shorter sides wide. Chosen by hand."""
 
 VIEWS = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90 view.png"
 
@@ -40,7 +39,7 @@ def require_pinhole(
     """Raise an ImageError if an image is a panorama or a fisheye picture.
 
     `rgb` (H, W, 3) are its pixels; if None, only its metadata are examined. If `rim`, a round
-    picture on black counts as a fisheye picture, although a plane seen through an eyepiece looks
+    picture on plain ground counts as a fisheye picture, although a plane in an eyepiece looks
     the same. The message calls an image that is not a file `name`.
     """
     raw = file_name(image).lower().endswith(RAW_SUFFIXES)
@@ -74,18 +73,17 @@ def require_pinhole(
 def edges_meet(gray: np.ndarray) -> bool:
     """Return whether an (H, W) image is wide and continues from its right edge to the left one."""
     height, width = gray.shape
-    if width < MIN_ASPECT * height or not gray.any():
+    if width < max(MIN_ASPECT * height, FAR):
         return False
-    values = gray[:: max(1, height // ROWS)].astype(np.float32)
-    contrast = np.maximum(np.abs(values - values.mean(axis=0)).mean(axis=0), 1e-6)
-
-    def unlike(lag: int) -> np.ndarray:  # relative to the contrast: plain columns are not alike
-        differences = np.abs(values[:, lag:] - values[:, :-lag]).mean(axis=0) + 1  # 1: rounding
-        return np.asarray(differences / np.minimum(contrast[lag:], contrast[:-lag]))
-
-    far = min(unlike(int(width * part)).min() for part in FAR)
-    seam = unlike(width - 1)[0]
-    return bool(MARGIN * seam < far and seam <= np.quantile(unlike(1), 1 - SHARPEST))
+    few, size = gray[:: max(1, height // (2 * ROWS))], (min(2 * ROWS, width), min(ROWS, height))
+    values = cv2.resize(few, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    values -= cv2.blur(values, (1, DETAIL))
+    values = np.sign(values) * np.sqrt(np.abs(values))  # so that no single outline decides
+    values /= np.sqrt((values**2).sum(axis=0) + len(values) / 12)  # 1/12: rounding
+    far = size[0] // FAR
+    mirrored = (values * values[:, ::-1]).sum(axis=0)[far // 2 : (size[0] - far) // 2]
+    alike = max((values[:, [0, -1]].T @ values[:, far:-far]).max(), mirrored.max())
+    return bool(MARGIN * (1 - values[:, 0] @ values[:, -1]) < 1 - alike)
 
 
 def is_cube_map(gray: np.ndarray) -> bool:
@@ -101,21 +99,23 @@ def is_cube_map(gray: np.ndarray) -> bool:
 
 
 def is_round(gray: np.ndarray, beside: int = 0) -> bool:
-    """Return whether an (H, W) image is dark outside a circle, which two image edges may cut.
+    """Return whether an (H, W) image is plain outside a circle, which two image edges may cut.
 
     If `beside` is 1, the image is half of a picture of two circles: the other may reach into it.
     """
     scale = SIDE_PX / min(gray.shape)
-    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    dark = int(small[[0, 0, -1, -1], [0, -1, 0, -1]].max())
-    bright = np.argwhere(small > dark + BLACK)[:, ::-1].astype(np.int32)
-    if dark > MAX_DARK or not len(bright):
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(int)
+    ground = small[[0, 0, -1, -1], [0, -1, 0, -1]]
+    apart = np.maximum(small - ground.max(), ground.min() - small)
+    other = np.argwhere(apart > BLACK)[:, ::-1].astype(np.int32)
+    if not len(other):
         return False
-    hull = cv2.convexHull(bright)
+    hull = cv2.convexHull(other)
     (x, y), radius = cv2.minEnclosingCircle(hull)
-    rows, columns = np.indices(small.shape)
-    disc = np.hypot(columns - x, rows - y) <= radius
-    filled = cv2.fillConvexPoly(np.zeros(small.shape, np.uint8), hull, 1)
+    beyond = np.hypot(*(np.indices(small.shape) - np.reshape((y, x), (2, 1, 1)))) - radius
+    plain = ground.max() <= MAX_DARK or np.ptp(ground) + apart[beyond > RIM].max(initial=0) <= PLAIN
+    filled = cv2.fillConvexPoly(np.zeros(small.shape, np.uint8), hull, 1).sum()
     spare = 2 * (1 - ROUNDNESS[0])
     least, most = (1 - spare) * SIDE_PX, (1 + spare) * min(max(small.shape), MAX_CUT * SIDE_PX)
-    return bool(least <= 2 * radius <= most and filled.sum() >= ROUNDNESS[beside] * disc.sum())
+    full = filled >= ROUNDNESS[beside] * (beyond <= 0).sum()
+    return bool(plain and full and least <= 2 * radius <= most)
