@@ -162,7 +162,8 @@ def register(
     geometry = matches.geometry
     if geometry is None or geometry.matrix is None:
         raise RegistrationError(
-            "no homography can be trusted: both images must show a plane or be taken from one place"
+            "no homography can be trusted: both images must show a plane or be taken from one "
+            "place, and more than a pattern that repeats"
         )
     homography, left_out = geometry.matrix, geometry.evidence.left_out
     if contradicts(geometry.evidence):
