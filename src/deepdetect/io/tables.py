@@ -156,8 +156,9 @@ def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except Exception as error:  # NumPy and the zip decoders raise many types of errors
         missing = "it has no array " if isinstance(error, KeyError) else ""
+        reason = "it is no .npz file" if "pickle" in str(error) else missing + first_line(error)
         raise InvalidFileError(
-            f"{path} contains no {content} ({missing}{first_line(error)}): give a file of them"
+            f"{path} contains no {content} ({reason}): give a file of them"
         ) from error
 
 
