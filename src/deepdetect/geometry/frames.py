@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from .._shared.machine import one_opencv_thread
@@ -95,7 +93,7 @@ def widened(mask: np.ndarray, radius_px: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
-def with_flat_parts(overlay: np.ndarray, images: Sequence[np.ndarray]) -> np.ndarray:
+def with_flat_parts(overlay: np.ndarray, images: list[np.ndarray]) -> np.ndarray:
     """Extend an (H, W) bool overlay by what is around it and equal in all (H, W, 3) uint8 images.
 
     Flat areas that continue to where images differ, as paper between letters does, are no part.

@@ -46,10 +46,10 @@ def composite(
     """Composite images on a canvas.
 
     `load` returns an image by its number, (H, W, 3) RGB, uint8 or uint16; it is called once per
-    box. `small` holds a reduced uint8 copy of each image, and its scale. Where all are `still`
-    (bool), an image is drawn only if no other shows the scene. Returns the panorama, black outside
-    all images and uint16 if any image is; its mask; the gain of each image; and, for each pair with
-    visible parallax, its displacement along the seam in pixels of the panorama.
+    box. `small` holds a reduced uint8 copy of each image, and its scale. Where all are `still`,
+    (h, w) bool, an image is drawn and blended only if no other shows the scene. Returns the
+    panorama, black outside all images and uint16 if any image is; its mask; the gain of each image;
+    and, for each pair with visible parallax, its displacement along the seam in panorama pixels.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
@@ -72,8 +72,7 @@ def composite(
         number = image_of(place)
         drawn = canvas.draw(place, load(number), 1.0, 1.0)
         mask = drawn.mask & _upscale_mask(seams[place], drawn.mask.shape)
-        image = drawn.image  # what is still would shine through the blending
-        image = continued(np.dstack([image, mask]))[:, :, :3] if still.any() else image
+        image = continued(np.dstack([drawn.image, mask]))[:, :, :3] if still.any() else drawn.image
         kind = np.uint16 if image.dtype == np.uint16 else kind
         blender.feed(image, gains[number] / np.iinfo(image.dtype).max, mask, drawn.corner)
     del drawn, image, mask

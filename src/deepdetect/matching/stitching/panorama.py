@@ -30,9 +30,6 @@ from .registration import JointRegistration, register_images
 Projection = Literal["plane", "cylindrical", "spherical"]
 PROJECTIONS = get_args(Projection)
 
-REGISTRATION_SIDES_PX = 100, 1200
-"""Range of `StitchingOptions.registration_side`. Larger images give no better homographies."""
-
 
 @suggest_keywords
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ class StitchingOptions:
     registration_side: int = 640
 
     def __post_init__(self) -> None:
-        sides = {"registration_side": REGISTRATION_SIDES_PX}
+        sides = {"registration_side": (100, 1200)}  # larger images give no better homographies
         check_ranges(self, positive=("scale", "max_canvas_megapixels"), between=sides)
 
 
@@ -189,8 +186,9 @@ def stitch(
         still = find_overlay([luma(rgb) for rgb in views], seed)
         if still.any():
             still = with_flat_parts(still, [rgb[:, :, :3] for rgb in views])
-            alphas = [np.where(still, 0, rgb[:, :, 3:].min(2, initial=255)) for rgb in views]
-            views = [np.dstack([rgb[:, :, :3], a]) for rgb, a in zip(views, alphas, strict=True)]
+            views = [
+                np.dstack([r[:, :, :3], ~still * r[:, :, 3:].min(2, initial=255)]) for r in views
+            ]
         tell_still(left_out := float(still.mean()))
         registration = register_images(
             views,
