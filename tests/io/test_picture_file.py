@@ -27,6 +27,7 @@ from deepdetect import (
 )
 from deepdetect.geometry import transform_points
 from deepdetect.io.exif import camera_from_exif
+from deepdetect.io.image import load_visible
 from deepdetect.io.picture_file import Metadata, read_metadata, save_picture
 
 SPACING_M, EAST, NORTH = 0.5, 500_000.0, 5_400_000.0
@@ -108,6 +109,7 @@ def test_a_registered_image_opens_in_its_place(
         assert file.read(1)[150, 200] == pytest.approx(scene[150, 200, 4] / 65535, abs=0.02)
 
 
+@pytest.mark.filterwarnings("ignore:.*stands still")  # a spot of this noise agrees by chance
 def test_a_panorama_lies_where_its_images_do(scene: np.ndarray, tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio")
     rgb = (scene[:, :, :3] >> 8).astype(np.uint8)
@@ -129,6 +131,29 @@ def test_a_panorama_lies_where_its_images_do(scene: np.ndarray, tmp_path: Path) 
     curved = ["--projection", "cylindrical", *how, str(tmp_path / "c.png")]
     if run_command(["stitch", *images, *curved]).exit_code == 0:
         assert not (tmp_path / "c.pgw").exists()
+
+
+def test_a_panorama_of_masked_images_is_masked(scene: np.ndarray, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    rgb = (scene[:, :, :3] >> 8).astype(np.uint8)
+    images = [str(tmp_path / f"{name}.tif") for name in "ab"]
+    for path, x in zip(images, (0, 150), strict=True):
+        geotiff(Path(path), rgb[50:350, x : x + 300], place(x, 50))
+        shown = np.full((300, 300), 255, np.uint8)
+        shown[: 100 - x // 3] = 0
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "r+") as file:
+            file.write_mask(shown)
+    how = ["--detector", "points", "--reference", images[0], "-o", str(tmp_path / "p.tif")]
+    result = run_command(["stitch", *images, *how])
+    assert result.exit_code == 0, result.output
+    with rasterio.open(tmp_path / "p.tif") as file:
+        found = file.dataset_mask() > 0
+        assert file.count == 3
+    expected = np.ones((300, 450), bool)
+    expected[:50] = expected[50:100, :150] = False
+    assert (found == expected).mean() > 0.995
+    assert [each.name for each in tmp_path.iterdir() if "msk" in each.name] == []
+    assert (load_visible(tmp_path / "p.tif")[1] == ~found).all()
 
 
 def test_world_files_profiles_and_exif_are_kept(photo: np.ndarray, tmp_path: Path) -> None:

@@ -420,8 +420,8 @@ def stitch(
         image, kept = kept.with_no_data(image, ~panorama.valid)
         save_picture(image, made["file"], kept, panorama.value_range)
         kept.write_beside(file)
-    for number, reason in panorama.unregistered.items():
-        failures.append(f"{images[number]} is not in the panorama: {reason}")
+    left = [{"image": images[k], "reason": reason} for k, reason in panorama.unregistered.items()]
+    failures += [f"{each['image']} is not in the panorama: {each['reason']}" for each in left]
     if panorama.parallax:
         (first, second), distance = max(panorama.parallax.items(), key=lambda item: item[1])
         cli.say(
@@ -432,9 +432,7 @@ def stitch(
     used = sorted(panorama.homographies)
     numbers = {
         "images": [images[k] for k in used],
-        "unregistered": [
-            {"image": images[k], "reason": reason} for k, reason in panorama.unregistered.items()
-        ],
+        "unregistered": left,
         "reference": images[panorama.reference],
         "width": width,
         "height": height,
@@ -446,6 +444,7 @@ def stitch(
             for (first, second), count in panorama.matches.items()
         ],
         "residual_px": round(panorama.residual_px, 4),
+        "left_out": round(panorama.left_out, 4),
         "closed": panorama.closed,
         "parallax": [
             {"images": [images[first], images[second]], "pixels": round(distance, 1)}

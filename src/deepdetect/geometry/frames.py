@@ -20,6 +20,10 @@ FRAME_MARGIN_PX = 8
 """Pixels up to this far from a frame or overlay belong to it, because keypoints there would show
 its edge. JPEG spreads an edge over blocks of this side."""
 
+MIN_COMMON = 0.95
+"""The uniform borders of two images stand still if they share at least this part of their union,
+and a flat area if at least this part of it is equal in all images."""
+
 
 def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     """Return the (H, W) bool mask of the uniform frame of a (H, W, 3) uint8 image.
@@ -87,6 +91,22 @@ def widened(mask: np.ndarray, radius_px: int) -> np.ndarray:
     """Return a (H, W) bool mask with all pixels up to `radius_px` away in x and in y."""
     side = 2 * radius_px + 1
     return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+
+
+def with_flat_parts(overlay: np.ndarray, images: list[np.ndarray]) -> np.ndarray:
+    """Extend an (H, W) bool overlay by what is around it and equal in all (H, W, 3) uint8 images.
+
+    Flat areas that continue to where images differ, as paper between letters does, are no part.
+    """
+    equal = (np.ptp(images, axis=0) <= MAX_FRAME_NOISE).all(axis=2)
+    steps = cv2.morphologyEx(images[0], cv2.MORPH_GRADIENT, np.ones((3, 3)))
+    flat = (steps <= MAX_FRAME_NOISE).all(axis=2)
+    areas = cv2.connectedComponents(np.uint8(flat))[1]
+    alike = np.bincount(areas.ravel(), equal.ravel()) >= MIN_COMMON * np.bincount(areas.ravel())
+    near = np.uint8(overlay | (equal & (alike[areas] | ~flat)))
+    near = cv2.morphologyEx(near, cv2.MORPH_OPEN, np.ones([2 * FRAME_MARGIN_PX + 1] * 2))
+    labels = cv2.connectedComponents(near)[1]
+    return widened(np.isin(labels, labels[overlay]), FRAME_MARGIN_PX)
 
 
 def filled_smoothly(gray: np.ndarray, mask: np.ndarray) -> np.ndarray:

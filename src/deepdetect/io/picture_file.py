@@ -82,6 +82,7 @@ class Metadata:
         exif: the EXIF as an object of Pillow, or None.
         bands: number of bands, alpha included.
         dtype: data type of a value.
+        mask: (H, W) bool, false where a GeoTIFF that is written has no data, or None.
     """
 
     to_world: np.ndarray | None = None
@@ -91,6 +92,7 @@ class Metadata:
     exif: Any = None
     bands: int = 3
     dtype: Any = np.uint8
+    mask: np.ndarray | None = None
 
     @property
     def plain(self) -> bool:
@@ -110,10 +112,10 @@ class Metadata:
         return (numbers if self.dtype.kind == "f" else np.rint(numbers)).astype(self.dtype)
 
     def with_no_data(self, image: np.ndarray, absent: np.ndarray) -> tuple[np.ndarray, Metadata]:
-        """Set absent pixels to the value that means "no data", if the data type can hold it."""
+        """Set absent pixels to the value that means "no data"; if there is none, mask them."""
         value, whole = self.no_data, np.iinfo(image.dtype) if image.dtype.kind in "iu" else None
         if value is None or not (whole is None or whole.min <= value <= whole.max):
-            return image, replace(self, no_data=None)
+            return image, replace(self, no_data=None, mask=~absent if absent.any() else None)
         filled = image.copy()
         filled[absent] = value
         return filled, self
@@ -211,6 +213,8 @@ class Metadata:
                     corner = self.to_world @ np.linalg.inv(FIRST_CENTRE)
                     file.transform = rasterio.Affine(*corner[:2].ravel())
                     file.crs = self.crs or rasterio.CRS()
+                    if self.mask is not None:
+                        file.write_mask(self.mask)
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
@@ -313,10 +317,10 @@ def _stored_pixels(orientation: int, width: int, height: int) -> np.ndarray:
 
 @contextmanager
 def _rasterio() -> Iterator[Any]:
-    """Yield rasterio; in the block it does not warn about images without a georeference."""
+    """Yield rasterio; masks go into files, and a missing georeference gives no warning."""
     import rasterio
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         yield rasterio
 

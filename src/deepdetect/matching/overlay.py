@@ -15,7 +15,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from ..features.selection import check_ignore
-from ..geometry.frames import FRAME_MARGIN_PX, filled_smoothly, uniform_frame, widened
+from ..geometry.frames import FRAME_MARGIN_PX, MIN_COMMON, filled_smoothly, uniform_frame, widened
 from ..geometry.images import BLUR_SIGMA_PX, gaussian_blur
 from ..geometry.transforms import scaled_points
 from ..io.image import luma
@@ -54,9 +54,6 @@ number of squares that contain some."""
 
 SOBEL_GAIN = 8
 """Sobel's 3 x 3 filter returns this multiple of the gradient."""
-
-MIN_COMMON = 0.95
-"""The uniform borders of two images stand still if they share at least this part of their union."""
 
 
 def scene_of(

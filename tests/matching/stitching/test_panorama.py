@@ -341,10 +341,36 @@ def test_screens_with_a_small_header_make_a_page() -> None:
     screens = [page[top : top + 300].copy() for top in (0, 80, 160)]
     for screen in screens:
         screen[:60] = skimage.data.coffee()[100:160, 100:400]
-    found = stitch(screens, PointDetector(1000))
+    with pytest.warns(UserWarning, match="stands still"):
+        found = stitch(screens, PointDetector(1000))
     assert found.image.shape[:2] == (460, 300)
+    below = np.abs(found.image[70:].astype(int) - page[70:460])
+    assert np.quantile(below, 0.999) < 40
+    header = np.abs(found.image[:55].astype(int) - screens[0][:55])
+    assert header.mean() < 4
     shifts = [found.homographies[number][1, 2] for number in range(3)]
     np.testing.assert_allclose(shifts, [0, 80, 160], atol=0.5)
+
+
+def test_a_logo_that_stands_still_is_drawn_only_where_nothing_else_is_seen() -> None:
+    """Two of three logos lie where another image shows the scene; so does the flat part of each."""
+    scene = np.ascontiguousarray(skimage.data.coffee()[:300])
+    images = [scene[:, left : left + 300].copy() for left in (0, 150, 300)]
+    whole = stitch(images, PointDetector(1000))
+    assert whole.left_out == 0
+    logo = np.full((90, 110, 3), (20, 20, 200), np.uint8)
+    cv2.putText(logo, "DD", (10, 70), cv2.FONT_HERSHEY_DUPLEX, 2, (255, 255, 255), 5)
+    for image in images:
+        image[180:270, 20:130] = logo
+    with pytest.warns(UserWarning, match="stands still"):
+        found = stitch(images, PointDetector(1000))
+    assert 0.11 < found.left_out < 0.25  # the logo covers 0.11
+    assert found.image.shape == whole.image.shape == (300, 600, 3)
+    error = np.abs(found.image.astype(int) - scene).max(axis=2)
+    error[170:280, 10:140] = 0  # only the first image shows this part
+    assert np.quantile(error, 0.999) < 40
+    assert found.valid.all()
+    np.testing.assert_allclose(found.image[230, 25], logo[50, 5], atol=12)
 
 
 @pytest.mark.parametrize(("scroll", "height"), [(500, None), (300, 1200)])
@@ -370,4 +396,6 @@ def test_screens_with_header_and_menu_are_no_pile(scroll: int, height: int | Non
         with pytest.raises(RegistrationError):
             stitch(screens)
     else:
-        assert stitch(screens).image.shape[:2] == (height, 900)
+        with pytest.warns(UserWarning, match="stands still"):
+            found = stitch(screens)
+        assert found.image.shape[:2] == (height, 900)

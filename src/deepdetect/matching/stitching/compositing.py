@@ -7,10 +7,11 @@ bands (Burt and Adelson, "A multiresolution spline with application to image mos
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 
+from ..._shared.alpha import continued
 from ..._shared.opencv import cv2
 from .canvas import Box, Canvas, WarpedImage, image_of
 
@@ -40,18 +41,28 @@ def composite(
     load: Callable[[int], np.ndarray],
     small: Mapping[int, tuple[np.ndarray, float]],
     canvas: Canvas,
+    still: np.ndarray = np.array(False),
 ) -> tuple[np.ndarray, np.ndarray, dict[int, float], dict[tuple[int, int], float]]:
     """Composite images on a canvas.
 
     `load` returns an image by its number, (H, W, 3) RGB, uint8 or uint16; it is called once per
-    box. `small` holds a reduced uint8 copy of each image, and its scale. Returns the panorama,
-    black outside all images and uint16 if any image is; its mask; the gain of each image; and, for
-    each pair with visible parallax, its displacement along the seam in pixels of the panorama.
+    box. `small` holds a reduced uint8 copy of each image, and its scale. Where all are `still`,
+    (h, w) bool, an image is drawn and blended only if no other shows the scene. Returns the
+    panorama, black outside all images and uint16 if any image is; its mask; the gain of each image;
+    and, for each pair with visible parallax, its displacement along the seam in panorama pixels.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
     low = {place: canvas.draw(place, *small[image_of(place)], scale) for place in canvas.boxes}
     low = {place: one for place, one in low.items() if one.mask.size}  # omits empty images
+    if still.any():
+        own = np.dstack([255 * ~still] * 4).astype(np.uint8)
+        seen = {
+            n: canvas.draw(n, own, small[image_of(n)][1], scale).mask & low[n].mask for n in low
+        }
+        for place, other in permutations(low, 2):
+            here, there = _overlap(low[place], low[other])
+            low[place].mask[here][(seen[place][here] == 0) & (seen[other][there] > 0)] = 0
     gains = _gains(low)
     seams = _seams(low, gains)
     parallax = {pair: px / scale for pair, px in _parallax(low, gains, seams).items()}
@@ -61,10 +72,10 @@ def composite(
         number = image_of(place)
         drawn = canvas.draw(place, load(number), 1.0, 1.0)
         mask = drawn.mask & _upscale_mask(seams[place], drawn.mask.shape)
-        kind = np.uint16 if drawn.image.dtype == np.uint16 else kind
-        top = np.iinfo(drawn.image.dtype).max
-        blender.feed(drawn.image, gains[number] / top, mask, drawn.corner)
-    del drawn, mask
+        image = continued(np.dstack([drawn.image, mask]))[:, :, :3] if still.any() else drawn.image
+        kind = np.uint16 if image.dtype == np.uint16 else kind
+        blender.feed(image, gains[number] / np.iinfo(image.dtype).max, mask, drawn.corner)
+    del drawn, image, mask
     valid = blender.weights[0][:height, :width] > 0
     blended = blender.blend()[:height, :width]
     depth = cv2.CV_16U if kind is np.uint16 else cv2.CV_8U
@@ -132,28 +143,25 @@ def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
     rows, right = [*np.eye(len(numbers)) / GAIN_PRIOR_STD], [0.0] * len(numbers)
     for (place, first), (other, second) in combinations(low.items(), 2):
         i, j = (numbers.index(image_of(each)) for each in (place, other))
-        means = None if i == j else _overlap_means(first, second)
-        if means is not None:
+        ratio = None if i == j else _log_ratio(first, second)
+        if ratio is not None:
             row = np.zeros(len(numbers))
             row[i], row[j] = 1 / GAIN_ERROR_STD, -1 / GAIN_ERROR_STD
             rows.append(row)
-            right.append(np.log(means[1] / means[0]) / GAIN_ERROR_STD)
+            right.append(ratio / GAIN_ERROR_STD)
     gains = np.exp(np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0])
     return dict(zip(numbers, gains.tolist(), strict=True))
 
 
-def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, float] | None:
-    """Return the mean brightness of both images in their overlap; None for small overlaps."""
+def _log_ratio(first: WarpedImage, second: WarpedImage) -> float | None:
+    """Return the log of the second image's brightness over the first's; None for small overlaps."""
     parts = _overlap(first, second)
     shared = (first.mask[parts[0]] > 0) & (second.mask[parts[1]] > 0)
     if np.count_nonzero(shared) < MIN_OVERLAP_PX:
         return None
-    # Adding 1 avoids a gain of 0 or infinity for black images.
-    means = [
-        float(one.image[part][shared].mean()) + 1
-        for one, part in zip((first, second), parts, strict=True)
-    ]
-    return means[0], means[1]
+    both = first.image[parts[0]], second.image[parts[1]]
+    means = [float(one[shared].mean()) + 1 for one in both]  # 1 avoids a gain of 0 or infinity
+    return float(np.log(means[1] / means[0]))
 
 
 def _overlap(first: WarpedImage, second: WarpedImage) -> list[tuple[slice, slice]]:
@@ -204,10 +212,7 @@ def _seams(low: Mapping[int, WarpedImage], gains: Mapping[int, float]) -> dict[i
     corners, masks = [one.corner for one in low.values()], [one.mask for one in low.values()]
     # Dynamic programming is used, because graph cuts take minutes if large overlaps are equal.
     masks = cv2.detail_DpSeamFinder("COLOR").find(images, corners, masks)
-    return {
-        number: mask.get() if isinstance(mask, cv2.UMat) else mask
-        for number, mask in zip(low, masks, strict=True)
-    }
+    return {n: m.get() if isinstance(m, cv2.UMat) else m for n, m in zip(low, masks, strict=True)}
 
 
 def _upscale_mask(seam: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

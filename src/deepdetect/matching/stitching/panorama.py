@@ -11,15 +11,17 @@ import numpy as np
 from ..._shared.alpha import continued
 from ..._shared.errors import OptionError, check_name
 from ..._shared.image_array import Channels, from_16_bits, to_8_bits
-from ..._shared.options import check_ranges, suggest_keywords, whole
+from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.progress import StageTimer
 from ..._shared.value_range import ValueRange
 from ...detector.detector import AnyDetector, DeepDetect
+from ...geometry.frames import with_flat_parts
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
-from ...io.image import load_pixels, one_range
+from ...io.image import load_pixels, luma, one_range
 from ...io.image_file import file_name, is_path, read_with
 from ...io.projection import require_pinhole
+from ..overlay import find_overlay, tell_still
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .canvas import Canvas, least_distorted, plan_curved, plan_plane
 from .compositing import composite, crop_box
@@ -27,10 +29,6 @@ from .registration import JointRegistration, register_images
 
 Projection = Literal["plane", "cylindrical", "spherical"]
 PROJECTIONS = get_args(Projection)
-
-
-REGISTRATION_SIDES_PX = 100, 1200
-"""Range of `StitchingOptions.registration_side`. Larger images give no better homographies."""
 
 
 @suggest_keywords
@@ -52,11 +50,8 @@ class StitchingOptions:
     registration_side: int = 640
 
     def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("scale", "max_canvas_megapixels"),
-            between={"registration_side": REGISTRATION_SIDES_PX},
-        )
+        sides = {"registration_side": (100, 1200)}  # larger images give no better homographies
+        check_ranges(self, positive=("scale", "max_canvas_megapixels"), between=sides)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,6 +76,7 @@ class Panorama:
             pairs where it is visible because the camera moved between them.
         closed: whether the panorama shows 360 degrees, and its right border continues at the left.
         value_range: the values of black and white in `image`, if it is uint16.
+        left_out: share that stands still in all images, drawn only where none shows the scene.
     """
 
     image: np.ndarray
@@ -95,6 +91,7 @@ class Panorama:
     parallax: dict[tuple[int, int], float]
     closed: bool
     value_range: ValueRange = (0, 65535)
+    left_out: float = 0.0
 
     def __repr__(self) -> str:
         height, width = self.valid.shape
@@ -176,11 +173,8 @@ def stitch(
     if not several or len(images) < 2:
         raise OptionError("a panorama needs at least two images: give more images")
     if reference is not None:
-        reference = whole("reference", reference)
-        if not 0 <= reference < len(images):
-            raise OptionError(
-                f"`reference` must be an image number, 0 to {len(images) - 1}, not {reference}"
-            )
+        check_name("reference", reference, range(len(images)))
+        reference = int(reference)
     names = [file_name(one) if is_path(one) else f"images[{k}]" for k, one in enumerate(images)]
     timer = StageTimer(progress)
     with one_range(images, channels) as reading:
@@ -188,8 +182,16 @@ def stitch(
     with timer.stage("reading"), read_with(reading):
         small, sizes, deep = _reduced(images, channels, options.registration_side)
     with timer.stage("registration"):
+        views = [rgb for rgb, _ in small.values()]
+        still = find_overlay([luma(rgb) for rgb in views], seed)
+        if still.any():
+            still = with_flat_parts(still, [rgb[:, :, :3] for rgb in views])
+            views = [
+                np.dstack([r[:, :, :3], ~still * r[:, :, 3:].min(2, initial=255)]) for r in views
+            ]
+        tell_still(left_out := float(still.mean()))
         registration = register_images(
-            [rgb for rgb, _ in small.values()],
+            views,
             DeepDetect() if detector is None else detector,
             reference=reference,
             turning=projection != "plane",
@@ -208,6 +210,7 @@ def stitch(
             lambda number: continued(load_pixels(images[number], channels, deep=True)),
             small,
             canvas,
+            still,
         )
         values = (0, 65535) if not deep or reading.deep_range is None else reading.deep_range
         if deep:
@@ -219,20 +222,9 @@ def stitch(
             if projection == "plane":
                 shift = translation_matrix(-left, -top)
                 homographies = {n: shift @ matrix for n, matrix in homographies.items()}
-    return Panorama(
-        panorama,
-        valid,
-        homographies,
-        reference,
-        registration.unregistered,
-        registration.matches,
-        registration.residual_px,
-        gains,
-        timer.seconds,
-        parallax,
-        canvas.closed,
-        values,
-    )
+    numbers = registration.unregistered, registration.matches, registration.residual_px
+    found = panorama, valid, homographies, reference, *numbers, gains, timer.seconds, parallax
+    return Panorama(*found, canvas.closed, values, left_out)
 
 
 def _reduced(

@@ -133,14 +133,9 @@ def register_images(
             f"{nothing} with a reliable homography: take images with common detail, from one place "
             "or of a plane"
         )
-    unregistered = {
-        number: "it overlaps with no other image"
-        if len(other) == 1
-        else "it overlaps only with others that are not in the panorama"
-        for other in groups
-        if other != group
-        for number in other
-    }
+    apart = "it overlaps only with others that are not in the panorama"
+    reasons = "it overlaps with no other image", apart
+    unregistered = {n: reasons[len(each) > 1] for each in groups if each != group for n in each}
     pairs = [pair for pair in pairs if pair.first in group]
     sizes = {number: views[number].gray.shape[::-1] for number in group}
     hint = "choose the projection 'plane'" if turning else "crop what stands still in all images"
@@ -315,20 +310,18 @@ def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
 def _compose(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
     """Compose homographies along the maximum spanning tree, to the frame of one image."""
     tree: list[RegisteredPair] = []
-    steps: list[tuple[int, int, np.ndarray]] = []
-    matches = dict.fromkeys(group, 0)
     for pair in sorted(pairs, key=lambda pair: -pair.matches):
         if pair.second not in _connected(pair.first, tree):
             tree.append(pair)
-            steps.append((pair.first, pair.second, np.linalg.inv(pair.homography)))
-            steps.append((pair.second, pair.first, pair.homography))
-        matches[pair.first] += pair.matches
-        matches[pair.second] += pair.matches
+    matches = {n: sum(p.matches for p in pairs if n in (p.first, p.second)) for n in group}
     homographies = {max(group, key=lambda number: matches[number]): np.eye(3)}
     queue = list(homographies)
     for number in queue:
-        for here, other, step in steps:
-            if here == number and other not in homographies:
+        for pair in tree:
+            step, other = np.linalg.inv(pair.homography), pair.second
+            if pair.second == number:
+                step, other = pair.homography, pair.first
+            if number in (pair.first, pair.second) and other not in homographies:
                 homographies[other] = homographies[number] @ step
                 queue.append(other)
     return homographies
