@@ -169,8 +169,8 @@ def _xml_values(node: ElementTree.Element) -> Any:
 
 def _calib_json(values: Values, image: Pair) -> dict[str, Any]:
     sides = [each for key in ("left", "right") if isinstance(each := values.get(key), Mapping)]
-    keys = {key for each in (values, *sides) for key in each}
-    if "focal_px" in keys or ("baseline_mm" in keys and keys <= {*OWN_KEYS}) or not values:
+    names = {key for each in (values, *sides) for key in each}
+    if "focal_px" in names or ("baseline_mm" in names and names <= {*OWN_KEYS}) or not values:
         for key, value in [item for each in (values, *sides) for item in each.items()]:
             if key not in OWN_KEYS and not isinstance(value, Mapping) and any(numbers_in(value)):
                 known = ", ".join(OWN_KEYS)

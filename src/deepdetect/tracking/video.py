@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import count, islice
 from pathlib import Path
 from typing import Any
@@ -195,13 +196,16 @@ class _Packets:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._video, self._read = path, None, 0
+        self._path, self._read = path, 0
         self._different: set[int] = set()
         self._text, self._told = "", False
 
+    @cached_property
+    def _video(self) -> Any:
+        return _undecoded(self._path)
+
     def compare(self, number: int, equal: int, size: int) -> None:
         """Read the packet of the last of `equal` frames that repeat the `size` values before."""
-        self._video = self._video or _undecoded(self._path)
         for _ in range(self._read, number):
             self._video.grab()
         packet, self._read = self._video.read()[1], number + 1
