@@ -127,7 +127,8 @@ def test_too_few_that_can_be_read(bad: str, files: list[Path]) -> None:
 def screens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared: Path) -> list[str]:
     """Screens of a page of text that scrolls under a header that does not."""
     monkeypatch.chdir(tmp_path)
-    return [str(each) for each in sorted((shared / "cases/stitch-fixed-header/screens").iterdir())]
+    folder = shared / "cases/stitch-fixed-header/screens"
+    return [str(folder / f"{k}.png") for k in (2, 3, 4)]
 
 
 @pytest.mark.slow
