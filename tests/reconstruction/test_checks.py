@@ -14,8 +14,7 @@ from deepdetect import Matches, estimate_pose
 from deepdetect._shared.errors import NoDepthError, ReconstructionError
 from deepdetect._shared.progress import StageTimer
 from deepdetect.geometry.camera import Calibration
-from deepdetect.geometry.estimation import TwoViewModel
-from deepdetect.geometry.two_view import fit_model, is_planar
+from deepdetect.geometry.two_view import fit_model
 from deepdetect.reconstruction.subpixel import refine_matches
 from deepdetect.reconstruction.two_view import MAX_SCENE_DISTANCE_PX, NO_DEPTH, checked_pose
 
@@ -90,23 +89,3 @@ def test_too_long_a_focal_length_is_seen_where_the_camera_turned_more(
         return
     with pytest.raises(ReconstructionError):
         check_all(points, calibration)
-
-
-@pytest.mark.parametrize("wrong", [0, 300])
-def test_a_plane_is_one_also_among_wrong_matches_and_depth_is_none(wrong: int) -> None:
-    """Up to 100 of 300 matches on a plane move further along their rows."""
-    generator = np.random.default_rng(0)
-    points0 = generator.uniform(0, 500, (300 + wrong, 2))
-    noise = generator.normal(0, 0.3, points0.shape)
-    for nearer, expected in ((0, True), (15, True), (70, False), (100, False)):
-        points1 = points0 + 5 + noise
-        points1[:nearer, 0] += np.linspace(8, 40, nearer)
-        points1[300:] = np.random.default_rng(1).uniform(0, 500, (wrong, 2))
-        plane, epipolar = (
-            fit_model(points0, points1, model, (500, 500), threshold)
-            for model, threshold in (("homography", 2), ("fundamental", 1.5))
-        )
-        planar = is_planar(points0, points1, plane, epipolar)
-        assert planar is expected
-    nothing = TwoViewModel("none", None, np.zeros(len(points0), bool), np.inf)
-    assert not is_planar(points0, points1, nothing, epipolar)

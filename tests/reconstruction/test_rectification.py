@@ -70,7 +70,6 @@ def test_rectified_scenes_are_recognised_exchanged_and_among_wrong_matches(
     assert found.rectified, found
     assert found.reason == ""
     assert not found.swapped
-    assert abs(found.vertical_offset) < 0.3
     assert found.disparities[0] > 0
     many = detect_rectification(*with_wrong((points0, points1), size, 0.8), size)
     assert many.rectified, many
@@ -139,7 +138,6 @@ def test_the_figures_are_those_of_the_pair() -> None:
     )
     assert found.on_rows == found.matches
     assert found.disparities == pytest.approx((12, 30, 48), abs=0.7)
-    assert found.vertical_offset == 0
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +168,6 @@ def test_small_copies_of_large_images_decide_alone(motorcycle: Any) -> None:
     expected = detect_rectification(fine.points0, fine.points1, size)
     for own, other in zip(found.disparities[::2], expected.disparities[::2], strict=True):
         assert own == pytest.approx(other, rel=0.1)
-    assert found.vertical_offset == pytest.approx(expected.vertical_offset, abs=0.3)
     exchanged = find_rectification(right, left)
     assert exchanged.rectified
     assert exchanged.swapped

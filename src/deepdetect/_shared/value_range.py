@@ -28,15 +28,13 @@ def range_of_uint16(array: np.ndarray, name: str, call: ValueRange | None) -> Va
     If a call has several images, these are the ends of their common range, which is `call`.
     """
     counts = counts_of(array)
-    if call is None:
-        return find_range(counts, name)
-    _tell_of_counts(counts, call, name)
-    low, high = map(round, call)
-    outside = (counts[1 : max(1, low)].sum() + counts[high + 1 : -1].sum()) / counts.sum()
+    low, high = map(round, call or find_range(counts))
+    tell_if_little(array, _white_above(high) if low else high, name)
+    outside = (counts[1 : max(1, low)].sum() + counts[high + 1 : -1].sum()) / max(array.size, 1)
     if outside > MAX_OUTLIERS:
         what = f"{outside:.1%} of {name} lies outside the images' common range, {low} to {high}"
         warnings.warn(f"{what}: give the range by `value_range`", UserWarning, stacklevel=2)
-    return call
+    return float(low), float(high)
 
 
 def counts_of(values: np.ndarray) -> np.ndarray:
@@ -44,13 +42,13 @@ def counts_of(values: np.ndarray) -> np.ndarray:
     return np.bincount(values.ravel(), minlength=1 << 16)
 
 
-def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
+def find_range(counts: np.ndarray) -> ValueRange:
     """Find the values of black and white from the counts of all 65536 values.
 
     White is the largest value of a depth in `SENSOR_BITS`. A few pixels above it, and padding with
     65535, are ignored if no value lies in the octave above white, where highlights would lie. Black
     is 0. But a narrow band of values that is farther from 0 than it is wide is spread over the grey
-    levels, at most one level per value. With a `name`, little use of the range causes a warning.
+    levels, at most one level per value.
     """
     levels = np.flatnonzero(counts)
     full = _white_above(levels.max(initial=0))
@@ -64,8 +62,6 @@ def find_range(counts: np.ndarray, name: str | None = None) -> ValueRange:
     padded = counts[65535] > shares[0]
     if counts[white + 1 : 2 * white + 2].any() or (padded and white < 256):
         white, high = full, 65535 if padded else high
-    if name is not None:
-        _tell_of_counts(counts, (0, white), name)
     width = high - low
     if not 0 < width < min(low, LITTLE_RANGE * white):
         return 0, white
@@ -79,18 +75,9 @@ def tell_if_little(values: np.ndarray, white: float, name: str) -> None:
     step = 1 + math.isqrt(values.size >> 16)  # a grid of some 65,536 values tells enough
     seen = values[::step, ::step]
     seen = seen[(seen > 0) & (seen < white)]  # the ends may be padding
-    if len(seen):
-        low, high = np.quantile(seen.astype(np.float64), (FEW, 1 - FEW))
-        _tell_if_little(float(low), float(high), white, name)
-
-
-def _tell_of_counts(counts: np.ndarray, limits: ValueRange, name: str) -> None:
-    total = np.cumsum(np.r_[0, counts[1:-1]])  # the ends may be padding
-    low, high = np.searchsorted(total, np.array([FEW, 1 - FEW]) * total[-1]) - limits[0]
-    _tell_if_little(float(low), float(high), limits[1] - limits[0], name)
-
-
-def _tell_if_little(low: float, high: float, white: float, name: str) -> None:
+    if not len(seen):
+        return
+    low, high = np.quantile(seen.astype(np.float64), (FEW, 1 - FEW))
     used = (high - low if high - low < low else high) / white
     if 0 < used < LITTLE_RANGE:
         what = f"{name} uses {used:.1%} of its range: give the range by `value_range`"

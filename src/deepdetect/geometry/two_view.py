@@ -6,12 +6,10 @@ import numpy as np
 
 from .camera import Calibration, Camera, Size
 from .estimation import (
-    MIN_FRACTION_OF_PLANE,
     GeometryOptions,
     TwoViewModel,
     estimate_geometry,
     log10_nfa,
-    measure_parallax,
 )
 from .refinement import START_FOCAL_LENGTHS
 
@@ -22,10 +20,6 @@ accurate keypoints, from reduced copies of the images."""
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
 """Inlier thresholds in pixels of the models by which a rectified pair or a pure rotation is
 recognised. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
-
-MIN_PLANAR_RATIO = 0.75
-"""A scene is a plane only if the homography has at least this fraction of the number of inliers of
-the fundamental matrix. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 MAX_MEDIAN_MOTION_PX, MAX_MOTION_PX, MOTION_QUANTILE = 0.5, 3.0, 0.9
 """Two images show the same view only if the median motion of matches is below MAX_MEDIAN_MOTION_PX,
@@ -47,22 +41,6 @@ def fit_model(
         return TwoViewModel("none", None, geometry.inliers, float("inf"))
     alarms = log10_nfa(geometry.inliers, model, threshold_px, size1)
     return TwoViewModel(model, geometry.matrix, geometry.inliers, alarms)
-
-
-def is_planar(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    plane: TwoViewModel,
-    epipolar: TwoViewModel,
-    seed: int = 0,
-) -> bool:
-    """Return whether the homography `plane` explains the correct matches among (M, 2) matches."""
-    least = MIN_PLANAR_RATIO * np.count_nonzero(epipolar.inliers)
-    if plane.matrix is None or np.count_nonzero(plane.inliers) < least:
-        return False
-    # `parallax.shows_depth` is not used: it counts all matches off the plane, also wrong ones.
-    parallax = measure_parallax(points0, points1, plane.matrix, seed)
-    return not parallax.exceeds(MIN_FRACTION_OF_PLANE)
 
 
 def is_static(motion_px: np.ndarray) -> bool:

@@ -187,7 +187,7 @@ def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOption
         if not counts.any():
             break
     if counts.any():
-        found = options.value_range or find_range(counts, file_name(seen[0]))
+        found = options.value_range or find_range(counts)
         options = replace(options, deep_range=found)
     with read_with(options):
         yield options

@@ -16,7 +16,7 @@ from ..features.selection import grid_subsample
 from ..geometry.camera import Calibration
 from ..geometry.estimation import MAX_LOG10_NFA, log10_nfa
 from ..geometry.transforms import scaled_points
-from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_static
+from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_static
 from ..matching.guided import ImagePair, Sources
 
 MAX_ROW_DISTANCE_PX = 1.0
@@ -25,7 +25,7 @@ of the principal point) of both views by at most twice this. Chosen by hand."""
 
 MIN_INLIER_RATIO = 0.9
 """A pair is rectified only if its matches on the same row number at least this fraction of the
-inliers of a fundamental matrix. Chosen by hand."""
+inliers of a fundamental matrix. It shows a plane if those of a homography do. Chosen by hand."""
 
 MIN_DISPARITY_SPREAD_PX = 2.0
 """A pair is rectified only if its disparities spread by at least this from the 5th to the 95th
@@ -89,8 +89,6 @@ class Rectification:
         on_rows: number of `matches` whose rows in the two images differ by at most one pixel.
         by_fundamental: number of matches that a fundamental matrix explains with that tolerance.
         matches: number of matches that were used, one per cell of the left image.
-        vertical_offset: median of y in the second image minus y in the first, in pixels, of the
-            matches that the fundamental matrix explains; NaN if there are none.
         disparities: 5th percentile, median and 95th percentile of the disparities of the matches on
             rows, in pixels; NaN if there are none.
     """
@@ -101,7 +99,6 @@ class Rectification:
     on_rows: int
     by_fundamental: int
     matches: int
-    vertical_offset: float
     disparities: tuple[float, float, float]
 
 
@@ -144,16 +141,11 @@ def _coarse_pass(
         limit = MAX_COARSE_ROW_ERROR_PX * scale
         decided = on_rows and _row_error(*matched, seed) < limit
     else:
-        best = found.by_fundamental
-        # Rejection needs a margin of three standard deviations of a binomial distribution.
-        deviation = np.sqrt(best * MIN_INLIER_RATIO * (1 - MIN_INLIER_RATIO))
-        decided = found.on_rows < MIN_INLIER_RATIO * best - 3 * deviation
+        decided = 2 * found.on_rows < found.by_fundamental
     if not decided:
         return None
     low, median, high = (value / scale for value in found.disparities)
-    return replace(
-        found, vertical_offset=found.vertical_offset / scale, disparities=(low, median, high)
-    )
+    return replace(found, disparities=(low, median, high))
 
 
 def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
@@ -192,9 +184,6 @@ def detect_rectification(
     epipolar = fit_model(first, second, "fundamental", size, limit / np.sqrt(2), seed)
     disparity = (first - second)[on_rows, 0]
     spread = np.quantile(disparity, [0.05, 0.5, 0.95]) if len(disparity) else np.full(3, np.nan)
-    vertical_offset = np.nan
-    if epipolar.inliers.any():
-        vertical_offset = float(np.median((second - first)[epipolar.inliers, 1]))
     on_rows_count, best = (int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers))
     reason = ""
     # Rows have no fitted parameters, so the NFA (false alarms) of a fundamental matrix is stricter.
@@ -212,7 +201,7 @@ def detect_rectification(
     elif spread[2] - spread[0] < MIN_PLANAR_SPREAD_PX:
         threshold_px = SCENE_THRESHOLDS_PX["homography"]
         plane = fit_model(first, second, "homography", size, threshold_px, seed)
-        if is_planar(first, second, plane, epipolar, seed):
+        if np.count_nonzero(plane.inliers) >= MIN_INLIER_RATIO * best:
             reason = "one homography explains all the matches: they all move nearly alike"
     return Rectification(
         rectified=not reason,
@@ -221,7 +210,6 @@ def detect_rectification(
         on_rows=on_rows_count,
         by_fundamental=best,
         matches=len(indices),
-        vertical_offset=vertical_offset,
         disparities=(float(spread[0]), float(spread[1]), float(spread[2])),
     )
 

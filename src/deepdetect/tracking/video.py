@@ -170,7 +170,8 @@ class FrameSource(AbstractContextManager["FrameSource"]):
                 equal, last = equal + 1 if same else 0, rgb
                 if same:
                     packets.compare(number, equal, rgb.size)
-                    packets.check(equal, min(EQUAL_FRAMES, (self.count or number + 2) - 1))
+                    most = min(EQUAL_FRAMES, (self.count or number + 2) - 1)
+                    packets.check(equal, most, most)
                 else:
                     packets.end()
                 yield Frame(number, rgb)
@@ -179,7 +180,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         if number == 1:
             raise DeepDetectError(f"{self.path} {SINGLE}")
         if equal and equal == (number - 1) // self.every:
-            packets.check(equal, equal)
+            packets.check(equal, equal, equal)
         packets.end()
 
     def __exit__(self, *_: object) -> None:
@@ -214,27 +215,22 @@ class _Packets:
             self._different.add(hash(packet.tobytes()))
         self._text = f"{equal + 1} frames of {self._path}, up to number {number}, are equal"
 
-    def check(self, equal: int, least: int) -> None:
-        """Raise an error if `least` equal frames should not be; warn if they may be."""
-        if len(self._different) >= least:
+    def check(self, equal: int, least: int, most: int = EQUAL_FRAMES) -> None:
+        """Raise an error if `most` equal frames should not be; once, warn if `least` may be."""
+        if len(self._different) >= most:
             raise InvalidFileError(
                 f"{self._text}, but should not be: the installed OpenCV may fail with interlaced "
                 f'videos; convert it, such as by ffmpeg -i "{self._path}" -vf yadif progressive.mp4'
             )
-        if equal >= least:
-            self._tell()
+        if equal >= least and not self._told:
+            text = f"{self._text}: check that nothing moves in them"
+            warnings.warn(text, UserWarning, stacklevel=2)
+            self._told = True
 
     def end(self) -> None:
         """Warn if equal frames that have ended may not be equal."""
-        if len(self._different) >= DOUBTFUL_FRAMES:
-            self._tell()
+        self.check(len(self._different), DOUBTFUL_FRAMES)
         self._different.clear()
-
-    def _tell(self) -> None:
-        if not self._told:
-            text = f"{self._text}: check that nothing moves in them"
-            warnings.warn(text, UserWarning, stacklevel=2)
-        self._told = True
 
 
 def _camera_number(source: str | Path | int) -> int | None:
