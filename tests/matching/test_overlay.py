@@ -82,6 +82,15 @@ def test_an_overlay_is_found_although_the_scene_moves_little_at_half_of_it(photo
     assert found[~masks[0]].mean() < 0.25  # of it, much is plain
 
 
+def test_a_caption_is_found_before_unlike_grounds(photo) -> None:
+    scene = cv2.resize(skimage.data.astronaut(), (900, 900), interpolation=cv2.INTER_AREA)
+    views = [scene[60 * k : 60 * k + 400, 160 * k : 160 * k + 560].copy() for k in range(3)]
+    masks = [caption(view, photo) for view in views]
+    found = find_overlay([gray(compressed(view)) for view in views])
+    assert found[masks[0] & masks[1] & masks[2]].mean() > 0.6
+    assert found.mean() < 0.2
+
+
 def test_a_scene_without_an_overlay_has_none(facade) -> None:
     scene = facade(0.3)
     assert not find_overlay([gray(scene.left), gray(scene.right)]).any()

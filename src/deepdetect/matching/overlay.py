@@ -26,10 +26,11 @@ COMPARED_SIDE_PX = 640
 """Images are reduced to this longer side before they are compared: captions stay legible at this
 size. All lengths below are in pixels of the reduced images."""
 
-WINDOW_PX, MAX_DIFFERENCE, MIN_GRADIENTS = 7, 0.3, 32.0
+WINDOW_PX, MAX_DIFFERENCE, MIN_LIKENESS, MIN_GRADIENTS = 7, 0.3, 0.95, 32.0
 """A place looks the same in two images if, in a window of side WINDOW_PX, the difference of their
-gradients is below MAX_DIFFERENCE times the sum of both, and this sum is above MIN_GRADIENTS: 2 grey
-levels per pixel in each image, as Sobel's filter scales them."""
+gradients is below MAX_DIFFERENCE times the sum of both, or their correlation is above MIN_LIKENESS
+(letters before a brighter ground), and the sum is above MIN_GRADIENTS: 2 grey levels per pixel in
+each image, as Sobel's filter scales them. 313 pairs without overlays have none with either."""
 
 MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
 """A match stands still if it moves by less than MAX_STILL_PX, about the error of a keypoint. The
@@ -124,14 +125,16 @@ def _gradients(gray: np.ndarray) -> np.ndarray:
 def _same(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return where two images have the same gradients, (H, W) bool."""
     one, other = _gradients(first), _gradients(second)
-    difference, both = (
-        cv2.boxFilter(lengths, -1, (WINDOW_PX, WINDOW_PX))
-        for lengths in (
-            np.linalg.norm(one - other, axis=2),
-            np.linalg.norm(one, axis=2) + np.linalg.norm(other, axis=2),
+    lengths = [np.linalg.norm(each, axis=2) for each in (one, other)]
+    difference, both, common, *squares = (
+        cv2.boxFilter(values, -1, (WINDOW_PX, WINDOW_PX))
+        for values in (
+            *(np.linalg.norm(one - other, axis=2), lengths[0] + lengths[1]),
+            *((one * other).sum(axis=2), lengths[0] ** 2, lengths[1] ** 2),
         )
     )
-    return np.asarray((difference < MAX_DIFFERENCE * both) & (both > MIN_GRADIENTS))
+    alike = common > MIN_LIKENESS * np.sqrt(np.maximum(squares[0] * squares[1], 1))
+    return np.asarray(((difference < MAX_DIFFERENCE * both) | alike) & (both > MIN_GRADIENTS))
 
 
 def _contradicted(still: np.ndarray, images: ImagePair, seed: int) -> np.ndarray:
