@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -189,3 +191,18 @@ def test_registration_follows_the_scene_below_a_still_header(photo: np.ndarray) 
         found = register(*views, PointDetector(2000))
     expected = np.array([[1, 0, 0], [0, 1, -60], [0, 0, 1]])
     assert np.abs(found.homography / found.homography[2, 2] - expected).max() < 0.5
+
+
+@pytest.mark.slow
+def test_a_caption_where_nothing_else_is_seen_to_move_is_told(shared: Path) -> None:
+    views = []
+    for number in (2, 6):
+        view = cv2.imread(str(shared / f"data/kitti-clip/{number:06}.jpg"))[:, :, ::-1]
+        view = cv2.resize(view, (828, 250), interpolation=cv2.INTER_AREA)
+        for k, text in enumerate(("12:04:31 CAM 1 48 km/h", "N48.137 E11.575 2023/05/14")):
+            cv2.putText(view, text, (10, 205 + 35 * k), cv2.FONT_HERSHEY_SIMPLEX, 1, WHITE, 2)
+        views.append(view)
+    with pytest.warns(UserWarning, match="stand"):
+        matches = match_images(*views)
+    assert matches.geometry is not None
+    assert matches.geometry.confidence == "fair" or matches.geometry.evidence.left_out > 0.01

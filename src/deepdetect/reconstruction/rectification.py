@@ -136,13 +136,9 @@ def _coarse_pass(
     found = detect_rectification(*matched, small, offset_px * scale, seed)
     if found.by_fundamental < MIN_COARSE_INLIERS:
         return None
-    if found.rectified:
-        on_rows = abs(found.disparities[1] + offset_px * scale) > MAX_ROW_DISTANCE_PX
-        limit = MAX_COARSE_ROW_ERROR_PX * scale
-        decided = on_rows and _row_error(*matched, seed) < limit
-    else:
-        decided = 2 * found.on_rows < found.by_fundamental
-    if not decided:
+    far = abs(found.disparities[1] + offset_px * scale) > MAX_ROW_DISTANCE_PX
+    exact = far and _row_error(*matched, seed) < MAX_COARSE_ROW_ERROR_PX * scale
+    if not (exact if found.rectified else 2 * found.on_rows < found.by_fundamental):
         return None
     low, median, high = (value / scale for value in found.disparities)
     return replace(found, disparities=(low, median, high))
