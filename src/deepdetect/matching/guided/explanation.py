@@ -219,11 +219,8 @@ class Explanation:
         if epipolar is not None:
             deep, best = None, part or flat
             foreground = flat is not None and flat.evidence.share < NEARLY_ALL
-            if (
-                part
-                or (flat is None and not pattern)
-                or (tracks and tracks.show_depth(foreground, self._seed))
-            ):
+            tried = part or (flat is None and not pattern)
+            if tried or (tracks and tracks.show_depth(foreground, self._seed)):
                 deep = self._along_rows(epipolar, best, free)
             if deep and any(_copies(deep, each) for each in refuting):
                 deep, pattern = None, True
@@ -231,7 +228,7 @@ class Explanation:
                 yield deep
             elif not pattern:
                 sparse.append(self._sparse(epipolar))
-        if flat is not None and part is None:
+        if flat is not None and (part is None or pattern):
             yield flat
         nothing = free is None and flat is None and (epipolar is None or pattern)
         self.refuted = nothing and surely
@@ -357,7 +354,8 @@ class Explanation:
                 alike |= layer.evidence.explained[cells]
         high = len(first.matches) >= MOST * len(matches) and self._is_sure(first)
         still = np.mean(np.linalg.norm(matches.points1 - starts, axis=1) < STILL_PX)
-        if own.model == "fundamental" and still >= MANY_STILL and len(set(self._pair.sizes)) == 1:
+        deep = own.model == "fundamental" and self._pair.sizes[0] == self._pair.sizes[1]
+        if deep and MANY_STILL <= still < 1 / 2:
             high = False
             text = f"{still:.0%} of the matches stand still while the others move"
             warnings.warn(f"{text}: an overlay, or what is far away", UserWarning, stacklevel=2)
