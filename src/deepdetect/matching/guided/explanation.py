@@ -355,7 +355,7 @@ class Explanation:
         high = len(first.matches) >= MOST * len(matches) and self._is_sure(first)
         still = np.mean(np.linalg.norm(matches.points1 - starts, axis=1) < STILL_PX)
         deep = own.model == "fundamental" and self._pair.sizes[0] == self._pair.sizes[1]
-        if deep and MANY_STILL <= still < 1 / 2:
+        if deep and still >= MANY_STILL:
             high = False
             text = f"{still:.0%} of the matches stand still while the others move"
             warnings.warn(f"{text}: an overlay, or what is far away", UserWarning, stacklevel=2)
