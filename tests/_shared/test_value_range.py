@@ -29,9 +29,10 @@ def levels(image: np.ndarray, low: float, high: float) -> np.ndarray:
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
 @pytest.mark.parametrize("hot", [0, 1, 9])
-def test_single_pixels_change_nothing_else(bits: int, hot: int) -> None:
+@pytest.mark.parametrize("lowest", [0.06, 1])
+def test_single_pixels_change_nothing_else(bits: int, hot: int, lowest: float) -> None:
     image = photograph(bits)
-    image[0, :hot], image[1, :hot] = 65535, 0
+    image[0, :hot], image[1, :hot] = np.linspace(max(2**bits, lowest * 65535), 65535, hot), 0
     np.testing.assert_array_equal(load_image(image), levels(image, 0, 2**bits - 1))
 
 
@@ -41,9 +42,9 @@ def test_padding_with_65535_is_white() -> None:
     np.testing.assert_array_equal(load_image(image), levels(image, 0, 4095))
 
 
-def test_highlights_are_no_outliers() -> None:
+def test_highlights_that_are_more_than_single_pixels_are_in_the_range() -> None:
     image = photograph(10)
-    image[0, :10] = np.linspace(1100, 65000, 10)
+    image[0, :40] = np.linspace(1100, 65000, 40)
     with pytest.warns(UserWarning, match="value_range"):
         found = load_image(image)
     np.testing.assert_array_equal(found, levels(image, 0, 65535))

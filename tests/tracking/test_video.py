@@ -1,9 +1,7 @@
 from __future__ import annotations
 
-import itertools
 import re
 import signal
-import warnings
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -120,14 +118,14 @@ def test_interlaced_videos_give_their_frames_or_none(
         assert max(errors("interlaced")) < 12
 
 
-def test_a_video_in_which_nothing_moves_is_read_and_told(moving_photo, tmp_path: Path) -> None:
+def test_a_video_in_which_nothing_moves_is_read(moving_photo, tmp_path: Path) -> None:
     shape = moving_photo(0).shape[1::-1]
     path, code = tmp_path / "still.avi", cv2.VideoWriter_fourcc(*"MJPG")
     writer = cv2.VideoWriter(str(path), cv2.CAP_OPENCV_MJPEG, code, 25, shape)
     for _ in range(6):
         writer.write(moving_photo(0)[..., ::-1].copy())
     writer.release()
-    with FrameSource(path) as source, pytest.warns(UserWarning, match="moves"):
+    with FrameSource(path) as source:
         assert len(list(source)) == 6
 
 
@@ -138,31 +136,34 @@ def test_packets_that_change_nothing_may_differ(moving_photo, tmp_path: Path) ->
     for _ in range(8):
         writer.write(np.full((*shape[::-1], 3), 200, np.uint8))
     writer.release()
-    with FrameSource(path) as source, pytest.warns(UserWarning, match="moves"):
+    with FrameSource(path) as source:
         assert len(list(source)) == 8
 
 
-def test_frames_that_repeat_later_are_told(moving_photo, tmp_path: Path) -> None:
+@pytest.mark.parametrize("still", [0, 6])
+def test_a_video_that_is_interlaced_from_its_middle_gives_its_frames_or_an_error(
+    still: int, moving_photo, tmp_path: Path
+) -> None:
     shape, code = moving_photo(0).shape[1::-1], cv2.VideoWriter_fourcc(*"mpg2")
+    numbers = [*[0] * still, *range(12)]
     for name in ("plain.mpg", "interlaced.mpg"):
         writer = cv2.VideoWriter(str(tmp_path / name), cv2.CAP_FFMPEG, code, 25, shape)
         if not writer.isOpened():
             pytest.skip("the installed OpenCV does not write MPEG-2")
-        for k in range(12):
+        for k in numbers:
             writer.write(moving_photo(k)[..., ::-1].copy())
         writer.release()
     first, second = ((tmp_path / name).read_bytes() for name in ("plain.mpg", "interlaced.mpg"))
     path = tmp_path / "both.mpg"
     path.write_bytes(first + interlaced(second))
-    frames: list[np.ndarray] = []
-    with FrameSource(path) as source, warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
+    with FrameSource(path) as source:
         try:
-            frames += [frame.rgb for frame in source]
-        except InvalidFileError:
+            frames = [frame.rgb for frame in source]
+        except InvalidFileError:  # OpenCV 4.14 and 5.0
             return
-    repeated = sum(np.array_equal(*two) for two in itertools.pairwise(frames))
-    assert len(told) == (repeated >= 4)  # OpenCV 4.13 decodes them
+    expected = [moving_photo(k) for k in numbers] * 2  # OpenCV 4.13
+    for found, true in zip(frames, expected, strict=True):
+        assert np.abs(found.astype(int) - true).mean() < 12
 
 
 class Camera:

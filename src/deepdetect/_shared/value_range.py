@@ -45,23 +45,20 @@ def counts_of(values: np.ndarray) -> np.ndarray:
 def find_range(counts: np.ndarray) -> ValueRange:
     """Find the values of black and white from the counts of all 65536 values.
 
-    White is the largest value of a depth in `SENSOR_BITS`. A few pixels above it, and padding with
-    65535, are ignored if no value lies in the octave above white, where highlights would lie. Black
-    is 0. But a narrow band of values that is farther from 0 than it is wide is spread over the grey
-    levels, at most one level per value.
+    White is the largest value of a depth in `SENSOR_BITS`. The share `MAX_OUTLIERS` of the pixels
+    may lie above it, and padding with 65535. Black is 0. But a narrow band of values that is
+    farther from 0 than it is wide is spread over the grey levels, at most one level per value.
     """
     levels = np.flatnonzero(counts)
-    full = _white_above(levels.max(initial=0))
     inner = levels[(levels > 0) & (levels < 65535)]  # 0 and 65535 may be padding
     if not len(inner):
-        return 0, full
+        return 0, _white_above(levels.max(initial=0))
     total = np.cumsum(counts[inner])
     shares = (MAX_OUTLIERS * total[-1], (1 - MAX_OUTLIERS) * total[-1])
     low, high = inner[np.searchsorted(total, shares)].tolist()
     white = _white_above(high)
-    padded = counts[65535] > shares[0]
-    if counts[white + 1 : 2 * white + 2].any() or (padded and white < 256):
-        white, high = full, 65535 if padded else high
+    if white < 256 and counts[65535] > shares[0]:  # a dark image with lamps
+        white = high = 65535
     width = high - low
     if not 0 < width < min(low, LITTLE_RANGE * white):
         return 0, white

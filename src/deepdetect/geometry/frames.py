@@ -8,9 +8,10 @@ from .._shared.machine import one_opencv_thread
 from .._shared.opencv import cv2
 
 MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
-MIN_SMOOTH_SHARE = 0.75
+MIN_SMOOTH_SHARE, MIN_NOISY_SHARE = 0.75, 0.5
 """Pixels of a frame differ from its colour by at most MAX_FRAME_NOISE grey levels per channel,
-about the noise of JPEG. At least MIN_RING_SHARE of the outermost pixels are exactly equal. Each
+about the noise of JPEG. At least MIN_RING_SHARE of the outermost pixels are exactly equal; or, if a
+frame is noisy, MIN_NOISY_SHARE are so much alike (9 of 3,447 photographs, half with a frame). Each
 part of the frame covers at least MIN_FRAME_SHARE of the image (one row of 500), the scene
 MIN_SCENE_SHARE: a portrait video covers 0.32 of a landscape one. The scene, or each part of the
 frame, comes within FRAME_MARGIN_PX of MIN_SMOOTH_SHARE of the outline of its convex hull: a scene
@@ -33,16 +34,21 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     """
     ring = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     values, counts = np.unique(ring @ np.array([65536, 256, 1]), return_counts=True)
-    if counts.max() < MIN_RING_SHARE * len(ring):
-        return np.zeros(rgb.shape[:2], bool)
     colour = (values[counts.argmax()] >> np.array([16, 8, 0]) & 255).astype(np.float64)
+    exact = counts.max() >= MIN_RING_SHARE * len(ring)
+    if not exact:  # a scanned or sent frame has noise
+        levels = ring.mean(axis=1).astype(int) // (MAX_FRAME_NOISE // 2)
+        alike = levels == np.bincount(levels).argmax()
+        colour = np.median(ring[alike], axis=0)
     near = (np.abs(ring - colour) <= MAX_FRAME_NOISE).all(axis=1)
+    if not exact and near.mean() < MIN_NOISY_SHARE:
+        return np.zeros(rgb.shape[:2], bool)
     colour = np.median(ring[near], axis=0)
     with one_opencv_thread():  # OpenCV would start more than OMP_NUM_THREADS allows
-        return _frame_of_colour(rgb, colour)
+        return _frame_of_colour(rgb, colour, exact)
 
 
-def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
+def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray, exact: bool) -> np.ndarray:
     nowhere = np.zeros(rgb.shape[:2], bool)
     flat = cv2.inRange(rgb, colour - MAX_FRAME_NOISE, colour + MAX_FRAME_NOISE)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(flat, connectivity=4)
@@ -55,6 +61,8 @@ def _frame_of_colour(rgb: np.ndarray, colour: np.ndarray) -> np.ndarray:
     hull, smooth = _convex_hull(scene)
     frame = ~hull
     if not (smooth and frame.any()):
+        if not exact:
+            return nowhere
         near = MAX_FRAME_NOISE // 4
         close = cv2.inRange(rgb, colour - near, colour + near) > 0
         # Unlike texture, most of a frame is much closer to its colour than JPEG noise allows.

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from ..features.selection import check_ignore
 from ..geometry.frames import FRAME_MARGIN_PX, MIN_COMMON, filled_smoothly, uniform_frame, widened
 from ..geometry.images import BLUR_SIGMA_PX, gaussian_blur
 from ..geometry.transforms import scaled_points
-from ..io.image import luma
+from ..io.image import at_pixels, luma
 from .guided import ImagePair, Pair, Sources
 from .guided.proposals import propose
 
@@ -55,6 +56,10 @@ number of squares that contain some."""
 
 SOBEL_GAIN = 8
 """Sobel's 3 x 3 filter returns this multiple of the gradient."""
+
+
+_Matched = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Positions of matches in two reduced images, (K, 2) each, and which belong to the scene."""
 
 
 def scene_of(
@@ -96,25 +101,58 @@ def tell_still(share: float) -> None:
         )
 
 
-def find_overlay(grays: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:
+def still_matches(
+    pair: ImagePair, points0: np.ndarray, points1: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return which matches stand still in an overlay that the others show, (K,) bool; its share."""
+    small, scales = pair.both(COMPARED_SIDE_PX)
+    still = _same(*small) if pair.sizes[0] == pair.sizes[1] else np.zeros(1, bool)
+    if np.count_nonzero(still) < MIN_AREA_PX:
+        return np.zeros(len(points0), bool), 0.0
+    places, ends = (scaled_points(*each) for each in zip((points0, points1), scales, strict=True))
+    # Dense matches at the edge of an overlay are wrong: they are drawn to it.
+    scene = ~at_pixels(widened(still, FRAME_MARGIN_PX), places)
+    found, least = _contradicted(still, small, lambda _: (places, ends, scene))
+    overlay = found & (least > MIN_MOTION_PX)
+    slow = np.linalg.norm(ends - places, axis=1) < MIN_MOTION_PX
+    return slow & at_pixels(overlay, places), float(overlay.mean())
+
+
+def find_overlay(grays: Sequence[np.ndarray], seed: int = 0, *, moves: bool = False) -> np.ndarray:
     """Return an (H, W) bool mask of the overlay in (H, W) uint8 images; empty if sizes differ.
 
     An overlay stands still in all images, and contradicts the motion from one image to the next.
+    If the camera certainly `moves`, it may fill most of the image.
     """
     if len({gray.shape for gray in grays}) > 1 or len(grays) < 2:
         return np.zeros(grays[0].shape, bool)
-    return _overlay_of([ImagePair(pair) for pair in itertools.pairwise(grays)], seed)
+    return _overlay_of([ImagePair(pair) for pair in itertools.pairwise(grays)], seed, moves)
 
 
-def _overlay_of(pairs: Sequence[ImagePair], seed: int) -> np.ndarray:
+def _overlay_of(pairs: Sequence[ImagePair], seed: int, moves: bool = False) -> np.ndarray:
     small = [pair.both(COMPARED_SIDE_PX)[0] for pair in pairs]
     compared = small if len(small) == 1 else [*small, (small[0][0], small[-1][1])]
     still = np.all([_same(*both) for both in compared], axis=0)
     found = np.zeros(still.shape, bool)
-    for pair in pairs if np.count_nonzero(still) >= MIN_AREA_PX else ():
-        found |= _contradicted(still, pair, seed)
+    enough = np.count_nonzero(still) >= MIN_AREA_PX
+    for pair, both in zip(pairs, small, strict=True) if enough else ():
+        found |= _contradicted(still, both, partial(_sparse_matches, pair, seed), moves)[0]
     whole = cv2.resize(np.uint8(found), pairs[0].sizes[0], interpolation=cv2.INTER_NEAREST)
     return widened(whole, FRAME_MARGIN_PX)
+
+
+def _sparse_matches(pair: ImagePair, seed: int, exactly_still: np.ndarray) -> _Matched:
+    """Match learned points of a reduced pair; those of the scene agree with one geometry."""
+    _, (scale, _) = pair.both(COMPARED_SIDE_PX)
+    found = Sources(pair).learned
+    places, ends = (scaled_points(p, scale) for p in (found.points0, found.points1))
+    scene = np.linalg.norm(ends - places, axis=1) > MAX_STILL_PX
+    proposed = (
+        propose(pair, found.chosen(scene), model, seed) for model in ("homography", "fundamental")
+    )
+    best = min(filter(None, proposed), key=lambda each: each.log10_nfa, default=None)
+    scene[scene] = best is not None and best.inliers
+    return places, ends, scene & ~at_pixels(exactly_still, places)
 
 
 def _gradients(gray: np.ndarray) -> np.ndarray:
@@ -137,10 +175,17 @@ def _same(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.asarray(((difference < MAX_DIFFERENCE * both) | alike) & (both > MIN_GRADIENTS))
 
 
-def _contradicted(still: np.ndarray, images: ImagePair, seed: int) -> np.ndarray:
-    """Return the regions of still places that the motion between two reduced images contradicts."""
-    size = still.shape[::-1]
-    pair, (scale, _) = images.both(COMPARED_SIDE_PX)
+def _contradicted(
+    still: np.ndarray,
+    pair: Pair,
+    matched: Callable[[np.ndarray], _Matched],
+    moves: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find regions of still places that the motion of matches in two reduced images contradicts.
+
+    Also returns the least motion of the scene's matches near each pixel, (H, W).
+    """
+    nowhere = np.zeros(still.shape, bool), np.zeros(still.shape)
     _, labels = cv2.connectedComponents(np.uint8(widened(still, FRAME_MARGIN_PX)))
     shift, known = _shifts(*pair)
 
@@ -154,30 +199,19 @@ def _contradicted(still: np.ndarray, images: ImagePair, seed: int) -> np.ndarray
         return overlay
 
     if not stands(still & known).any():  # before the matching, which takes longest
-        return np.zeros(still.shape, bool)
-    tentative = Sources(images).learned
-    places, ends = (scaled_points(p, scale) for p in (tentative.points0, tentative.points1))
-    motion = ends - places
-    moves = np.linalg.norm(motion, axis=1) > MAX_STILL_PX
-    standing, scene, motion = places[~moves], places[moves], motion[moves]
-    proposed = (
-        propose(images, tentative.chosen(moves), model, seed)
-        for model in ("homography", "fundamental")
-    )
-    found = min(filter(None, proposed), key=lambda each: each.log10_nfa, default=None)
+        return nowhere
     exactly = still & known & (np.linalg.norm(shift, axis=2) < MAX_SHIFT_PX)
-    column, row = np.rint(scene).astype(int).T
-    if found is None:
-        return np.zeros(still.shape, bool)
-    tells = found.inliers & ~exactly[row, column]  # a match moving there is inexact
-    scene, motion = scene[tells], motion[tells]
-    cells, moving_cells = (len(np.unique(xy // CELL_PX, axis=0)) for xy in (standing, scene))
+    places, ends, scene = matched(exactly)
+    stays = np.linalg.norm(ends - places, axis=1) <= MAX_STILL_PX
+    scene = scene & ~stays
+    cells, moving_cells = (len(np.unique(places[k] // CELL_PX, axis=0)) for k in (stays, scene))
     # If more of the image stands still than moves, something moves in front of a still camera.
-    if len(scene) < NEIGHBOURS or cells > moving_cells:
-        return np.zeros(still.shape, bool)
-    flow, least = _motion_of_scene(scene, motion, size)
-    ends = np.float32(np.dstack(np.meshgrid(*map(np.arange, size)))) + flow
-    moved = cv2.remap(pair[1], ends, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if np.count_nonzero(scene) < NEIGHBOURS or (cells > moving_cells and not moves):
+        return nowhere
+    size = still.shape[::-1]
+    flow, least = _motion_of_scene(places[scene], (ends - places)[scene], size)
+    there = np.float32(np.dstack(np.meshgrid(*map(np.arange, size)))) + flow
+    moved = cv2.remap(pair[1], there, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     clear = still & (least > MIN_MOTION_PX)
     shown = clear & known & ~_same(pair[0], moved)
     still_px, clear_px = (
@@ -188,7 +222,7 @@ def _contradicted(still: np.ndarray, images: ImagePair, seed: int) -> np.ndarray
         np.uint8(widened(still & (exactly | ~known), FRAME_MARGIN_PX))
     )
     exact_px = np.bincount(parts[shown & exactly], minlength=parts.max() + 1)
-    return most[labels] | (exact_px >= WINDOW_PX**2)[parts]
+    return most[labels] | (exact_px >= WINDOW_PX**2)[parts], least
 
 
 def _shifts(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -32,7 +32,7 @@ from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, at_pixels, load_pair
 from ..io.projection import require_pinhole
 from .guided import Explanation, ImagePair
-from .overlay import scene_of, tell_still
+from .overlay import scene_of, still_matches, tell_still
 
 GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
 """The stages that `match_images` reports."""
@@ -108,23 +108,22 @@ def match_images(
     if model != "homography":
         _require_pinholes((image0, image1), rgb, rim=False)
     pair, left_out = scene_of(rgb, masks, seed)
-    masks = pair.masks
     timer = StageTimer(progress)
     with timer.stage("keypoints"):
         keypoints0, keypoints1 = (
             find_keypoints(detector, image, selection, mask)
-            for image, mask in zip(rgb, masks, strict=True)
+            for image, mask in zip(rgb, pair.masks, strict=True)
         )
     settings = guiding, model, seed, options, timer
     matches = _match_guided(pair, (keypoints0, keypoints1), given, *settings)
-    matches = _noted(_unmasked(matches, masks), left_out)
+    matches = _unmasked(matches, pair, left_out)
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
         _require_pinholes((image0, image1), rgb, rim=True)  # with an eyepiece, a homography fits
     if not (mutual and matches.success):
         return matches
     given = None if given is None else given[::-1]
     back = _match_guided(pair.swapped(), (keypoints1, keypoints0), given, *settings)
-    back = _noted(_unmasked(back, masks[::-1]), left_out)
+    back = _unmasked(back, pair.swapped(), left_out)
     return _found_both_ways(matches, back)
 
 
@@ -294,10 +293,16 @@ def _require_pinholes(images: tuple[Any, Any], rgb: Points, *, rim: bool) -> Non
         require_pinhole(image, rgb[number], rim=rim, name=f"images[{number}]")
 
 
-def _unmasked(matches: Matches, masks: Sequence[np.ndarray | None]) -> Matches:
-    """Drop matches that start or end in a mask: guided matches may end where no keypoint is."""
-    dropped = at_pixels(masks[0], matches.points0) | at_pixels(masks[1], matches.points1)
-    return matches[~dropped] if dropped.any() else matches
+def _unmasked(matches: Matches, pair: ImagePair, left_out: float) -> Matches:
+    """Drop matches in a mask, as guided ones may end there, or that stand still in an overlay."""
+    ends, masks = (matches.points0, matches.points1), pair.masks
+    dropped = at_pixels(masks[0], ends[0]) | at_pixels(masks[1], ends[1])
+    if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
+        still, share = still_matches(pair, *ends)
+        if still.any():
+            tell_still(share)
+            dropped, left_out = dropped | still, left_out + share
+    return _noted(matches[~dropped] if dropped.any() else matches, left_out)
 
 
 def _found_both_ways(matches: Matches, back: Matches) -> Matches:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -38,7 +37,8 @@ MAX_FPS = 1000.0
 EQUAL_FRAMES, DOUBTFUL_FRAMES = 24, 4
 """If as many frames as EQUAL_FRAMES are really equal to the one before, so are some of their
 packets, since counters in H.264 headers restart after 16 frames, and MPEG's groups of pictures
-after 12 to 15. DOUBTFUL_FRAMES whose packets are all different are told."""
+after 12 to 15. DOUBTFUL_FRAMES whose packets are all different are read again by another reader,
+whose memory holds no earlier frame."""
 
 SINGLE = "has a single frame: give a video, or a folder of frames"
 
@@ -169,9 +169,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
                 same = not self.live and np.array_equal(rgb, last)
                 equal, last = equal + 1 if same else 0, rgb
                 if same:
-                    packets.compare(number, equal, rgb.size)
-                    most = min(EQUAL_FRAMES, (self.count or number + 2) - 1)
-                    packets.check(equal, most, most)
+                    packets.check(number, equal, bgr, (self.count or number + 2) - 1)
                 else:
                     packets.end()
                 yield Frame(number, rgb)
@@ -180,8 +178,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         if number == 1:
             raise DeepDetectError(f"{self.path} {SINGLE}")
         if equal and equal == (number - 1) // self.every:
-            packets.check(equal, equal, equal)
-        packets.end()
+            packets.check(number - 1, equal, bgr, equal)
 
     def __exit__(self, *_: object) -> None:
         if self._capture is not None:
@@ -193,44 +190,52 @@ class _Packets:
 
     The conversion of interlaced frames fails in OpenCV 4.14 and 5.0, which then return the previous
     contents of the memory. If the frames of a video are really equal, some of its packets are
-    equal, or packets only state that nothing changes.
+    equal, or packets only state that nothing changes; or another reader returns the same.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._read = path, 0
+        self._path, self._read, self._grabbed = path, 0, 0
+        self.end()
+
+    def end(self) -> None:
+        """Begin anew where a frame differs from the one before."""
         self._different: set[int] = set()
-        self._text, self._told = "", False
+        self._sure = False
 
     @cached_property
     def _video(self) -> Any:
         return _undecoded(self._path)
 
-    def compare(self, number: int, equal: int, size: int) -> None:
-        """Read the packet of the last of `equal` frames that repeat the `size` values before."""
+    @cached_property
+    def _other(self) -> Any:
+        return cv2.VideoCapture(str(self._path))
+
+    def check(self, number: int, equal: int, bgr: np.ndarray, most: int) -> None:
+        """Raise an error if a frame, one of `equal` ones that repeat another, should not do so.
+
+        The video ends after `most`.
+        """
+        if self._sure:
+            return
         for _ in range(self._read, number):
             self._video.grab()
         packet, self._read = self._video.read()[1], number + 1
         # An encoder spends one bit on an unchanged block of 16x16 pixels; headers, up to 100 bytes.
-        if packet is not None and packet.size > size / 3 / 16**2 / 8 + 100:
+        if packet is not None and packet.size > bgr.size / 3 / 16**2 / 8 + 100:
             self._different.add(hash(packet.tobytes()))
-        self._text = f"{equal + 1} frames of {self._path}, up to number {number}, are equal"
-
-    def check(self, equal: int, least: int, most: int = EQUAL_FRAMES) -> None:
-        """Raise an error if `most` equal frames should not be; once, warn if `least` may be."""
-        if len(self._different) >= most:
+        wrong = len(self._different) >= min(EQUAL_FRAMES, most)
+        if len(self._different) == DOUBTFUL_FRAMES:
+            for _ in range(self._grabbed, number + 1):
+                self._other.grab()
+            self._grabbed = number + 1
+            wrong = not np.array_equal(self._other.retrieve()[1], bgr)
+            self._sure = not wrong and np.ptp(bgr) > 0  # new memory may hold zeros
+        if wrong:
             raise InvalidFileError(
-                f"{self._text}, but should not be: the installed OpenCV may fail with interlaced "
-                f'videos; convert it, such as by ffmpeg -i "{self._path}" -vf yadif progressive.mp4'
+                f"{equal + 1} frames of {self._path}, up to number {number}, are equal, but should "
+                "not be: the installed OpenCV may fail with interlaced videos; convert it, such as "
+                f'by ffmpeg -i "{self._path}" -vf yadif progressive.mp4'
             )
-        if equal >= least and not self._told:
-            text = f"{self._text}: check that nothing moves in them"
-            warnings.warn(text, UserWarning, stacklevel=2)
-            self._told = True
-
-    def end(self) -> None:
-        """Warn if equal frames that have ended may not be equal."""
-        self.check(len(self._different), DOUBTFUL_FRAMES)
-        self._different.clear()
 
 
 def _camera_number(source: str | Path | int) -> int | None:

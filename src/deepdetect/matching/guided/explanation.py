@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -60,10 +59,9 @@ MIN_GAIN = 1.05
 """A plane moves on its own if it and a fundamental matrix of the rest alone fit this many times as
 many matches as the matrix of all, and this one fits less than a third of those on the plane."""
 
-MAX_STILL, STILL_PX, MANY_STILL = 0.005, 0.5, 0.1
-"""A homography that moves the corners by less than the fraction MAX_STILL of the longer side stands
-still: 3 pixels of 640 are its inlier threshold. Matches of a scene with depth stand still below
-STILL_PX; the fraction MANY_STILL may be an overlay: of streets, 0.04 do, with a time stamp 0.17."""
+MAX_STILL = 0.005
+"""A homography that moves the corners by less than this fraction of the longer side stands still: 3
+pixels of 640 are its inlier threshold."""
 
 MIN_MOVING = 0.5
 """What stands still (a caption, a part of the vehicle) is left out if a moving geometry explains at
@@ -353,12 +351,6 @@ class Explanation:
             for layer in self.layers[1:]:
                 alike |= layer.evidence.explained[cells]
         high = len(first.matches) >= MOST * len(matches) and self._is_sure(first)
-        still = np.mean(np.linalg.norm(matches.points1 - starts, axis=1) < STILL_PX)
-        deep = own.model == "fundamental" and self._pair.sizes[0] == self._pair.sizes[1]
-        if deep and still >= MANY_STILL:
-            high = False
-            text = f"{still:.0%} of the matches stand still while the others move"
-            warnings.warn(f"{text}: an overlay, or what is far away", UserWarning, stacklevel=2)
         evidence = PublicEvidence(
             len(own.tentative.points0),
             int(np.count_nonzero(own.inliers)),

@@ -47,7 +47,7 @@ def composite(
 
     `load` returns an image by its number, (H, W, 3) RGB, uint8 or uint16; it is called once per
     box. `small` holds a reduced uint8 copy of each image, and its scale. Where all are `still`,
-    (h, w) bool, an image is drawn and blended only if no other shows the scene. Returns the
+    (h, w) bool, one image is drawn, and only if no other shows the scene. Returns the
     panorama, black outside all images and uint16 if any image is; its mask; the gain of each image;
     and, for each pair with visible parallax, its displacement along the seam in panorama pixels.
     """
@@ -62,7 +62,8 @@ def composite(
         }
         for place, other in permutations(low, 2):
             here, there = _overlap(low[place], low[other])
-            low[place].mask[here][(seen[place][here] == 0) & (seen[other][there] > 0)] = 0
+            shown = seen[other][there] | low[other].mask[there] * np.uint8(other < place)
+            low[place].mask[here][(seen[place][here] == 0) & (shown > 0)] = 0
     gains = _gains(low)
     seams = _seams(low, gains)
     parallax = {pair: px / scale for pair, px in _parallax(low, gains, seams).items()}

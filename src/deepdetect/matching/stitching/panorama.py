@@ -183,7 +183,7 @@ def stitch(
         small, sizes, deep = _reduced(images, channels, options.registration_side)
     with timer.stage("registration"):
         views = [rgb for rgb, _ in small.values()]
-        still = find_overlay([luma(rgb) for rgb in views], seed)
+        still = find_overlay([luma(rgb) for rgb in views], seed, moves=True)
         if still.any():
             still = with_flat_parts(still, [rgb[:, :, :3] for rgb in views])
             views = [
