@@ -110,9 +110,12 @@ def still_matches(
     if np.count_nonzero(still) < MIN_AREA_PX:
         return np.zeros(len(points0), bool), 0.0
     places, ends = (scaled_points(*each) for each in zip((points0, points1), scales, strict=True))
-    # Dense matches at the edge of an overlay are wrong: they are drawn to it.
-    scene = ~at_pixels(widened(still, FRAME_MARGIN_PX), places)
-    found, least = _contradicted(still, small, lambda _: (places, ends, scene))
+    found, least = _contradicted(
+        still, small, lambda exactly: (places, ends, ~at_pixels(exactly, places))
+    )
+    if found.any():  # matches around what stands still show nothing, because it attracts them
+        scene = ~at_pixels(widened(still, FRAME_MARGIN_PX), places)
+        found, least = _contradicted(still, small, lambda _: (places, ends, scene))
     overlay = found & (least > MIN_MOTION_PX)
     slow = np.linalg.norm(ends - places, axis=1) < MIN_MOTION_PX
     return slow & at_pixels(overlay, places), float(overlay.mean())

@@ -41,10 +41,6 @@ GRID_SIZE_PX = 8
 MIN_COARSE_INLIERS = 50
 """The coarse pass decides only if at least this number of matches fit a fundamental matrix."""
 
-MAX_COARSE_ROW_ERROR_PX = 0.6
-"""The coarse pass accepts a pair as rectified only if its `_row_error`, in pixels of the full
-images, is below this. Many matches determine this error, so the limit can be below 1."""
-
 MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
 """The focal lengths of rectified views may differ by at most this fraction, so that values rounded
 to three digits pass. If they differ by this much, a row 200 px from the middle is off by 2 px."""
@@ -125,7 +121,7 @@ def find_rectification(
 def _coarse_pass(
     sources: Sources, size: tuple[int, int], offset_px: float, seed: int
 ) -> Rectification | None:
-    """Decide from small copies of two images of the same size; None if these do not suffice."""
+    """Recognise in small copies that a pair is not rectified; None if these do not suffice."""
     coarse = sources.learned
     scale = 1 / coarse.pixel
     if scale == 1:
@@ -134,32 +130,11 @@ def _coarse_pass(
     matched = scaled_points(coarse.points0, scale), scaled_points(coarse.points1, scale)
     # A distance of 1 px in the copies is more at full size, so the limit for rows is generous.
     found = detect_rectification(*matched, small, offset_px * scale, seed)
-    if found.by_fundamental < MIN_COARSE_INLIERS:
-        return None
-    far = abs(found.disparities[1] + offset_px * scale) > MAX_ROW_DISTANCE_PX
-    exact = far and _row_error(*matched, seed) < MAX_COARSE_ROW_ERROR_PX * scale
-    if not (exact if found.rectified else 2 * found.on_rows < found.by_fundamental):
+    few = found.by_fundamental < MIN_COARSE_INLIERS
+    if few or found.rectified or 2 * found.on_rows >= found.by_fundamental:
         return None
     low, median, high = (value / scale for value in found.disparities)
     return replace(found, disparities=(low, median, high))
-
-
-def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
-    """Return the `MIN_INLIER_RATIO` quantile of the row errors of a pair that looks rectified.
-
-    The row error at a position is the difference of the rows of both images in pixels. A single
-    match is too inaccurate, so a smooth function is fitted to y1 - y0 of all matches. The function
-    depends on the position, for rotated views and lens distortion, and on the disparity, for a
-    camera that also moved up or down.
-    """
-    indices = grid_subsample(points0, GRID_SIZE_PX, seed)
-    first, second = points0[indices], points1[indices]
-    off, disparity = second[:, 1] - first[:, 1], first[:, 0] - second[:, 0]
-    near = np.abs(off) <= MAX_ROW_DISTANCE_PX
-    x, y = ((first[near] - first[near].mean(axis=0)) / np.ptp(first[near], axis=0).max()).T
-    design = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y, disparity[near]])
-    predicted = design @ np.linalg.lstsq(design, off[near], rcond=None)[0]
-    return float(np.quantile(np.abs(predicted), MIN_INLIER_RATIO))
 
 
 def detect_rectification(

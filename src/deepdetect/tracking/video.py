@@ -34,11 +34,9 @@ FOLDER_FPS = 10.0
 MAX_FPS = 1000.0
 """If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
-EQUAL_FRAMES, DOUBTFUL_FRAMES = 24, 4
-"""If as many frames as EQUAL_FRAMES are really equal to the one before, so are some of their
-packets, since counters in H.264 headers restart after 16 frames, and MPEG's groups of pictures
-after 12 to 15. DOUBTFUL_FRAMES whose packets are all different are read again by another reader,
-whose memory holds no earlier frame."""
+EQUAL_FRAMES = 4
+"""After so many frames that are equal to the one before although their packets differ, another
+reader, whose memory holds no earlier frame, tells whether they really are."""
 
 SINGLE = "has a single frame: give a video, or a folder of frames"
 
@@ -223,14 +221,14 @@ class _Packets:
         # An encoder spends one bit on an unchanged block of 16x16 pixels; headers, up to 100 bytes.
         if packet is not None and packet.size > bgr.size / 3 / 16**2 / 8 + 100:
             self._different.add(hash(packet.tobytes()))
-        wrong = len(self._different) >= min(EQUAL_FRAMES, most)
-        if len(self._different) == DOUBTFUL_FRAMES:
-            for _ in range(self._grabbed, number + 1):
-                self._other.grab()
-            self._grabbed = number + 1
-            wrong = not np.array_equal(self._other.retrieve()[1], bgr)
-            self._sure = not wrong and np.ptp(bgr) > 0  # new memory may hold zeros
-        if wrong:
+        if len(self._different) < min(EQUAL_FRAMES, most):
+            return
+        for _ in range(self._grabbed, number + 1):
+            self._other.grab()
+        self._grabbed = number + 1
+        same = np.array_equal(self._other.retrieve()[1], bgr)
+        self._sure = same and np.ptp(bgr) > 0  # new memory may hold zeros
+        if not self._sure:
             raise InvalidFileError(
                 f"{equal + 1} frames of {self._path}, up to number {number}, are equal, but should "
                 "not be: the installed OpenCV may fail with interlaced videos; convert it, such as "
