@@ -110,12 +110,12 @@ def still_matches(
     if np.count_nonzero(still) < MIN_AREA_PX:
         return np.zeros(len(points0), bool), 0.0
     places, ends = (scaled_points(*each) for each in zip((points0, points1), scales, strict=True))
-    found, least = _contradicted(
+    _, found, least = _contradicted(
         still, small, lambda exactly: (places, ends, ~at_pixels(exactly, places))
     )
     if found.any():  # matches around what stands still show nothing, because it attracts them
         scene = ~at_pixels(widened(still, FRAME_MARGIN_PX), places)
-        found, least = _contradicted(still, small, lambda _: (places, ends, scene))
+        _, found, least = _contradicted(still, small, lambda _: (places, ends, scene))
     overlay = found & (least > MIN_MOTION_PX)
     slow = np.linalg.norm(ends - places, axis=1) < MIN_MOTION_PX
     return slow & at_pixels(overlay, places), float(overlay.mean())
@@ -139,7 +139,8 @@ def _overlay_of(pairs: Sequence[ImagePair], seed: int, moves: bool = False) -> n
     found = np.zeros(still.shape, bool)
     enough = np.count_nonzero(still) >= MIN_AREA_PX
     for pair, both in zip(pairs, small, strict=True) if enough else ():
-        found |= _contradicted(still, both, partial(_sparse_matches, pair, seed), moves)[0]
+        matched = partial(_sparse_matches, pair, seed)
+        found |= np.any(_contradicted(still, both, matched, moves)[:2], axis=0)
     whole = cv2.resize(np.uint8(found), pairs[0].sizes[0], interpolation=cv2.INTER_NEAREST)
     return widened(whole, FRAME_MARGIN_PX)
 
@@ -183,12 +184,13 @@ def _contradicted(
     pair: Pair,
     matched: Callable[[np.ndarray], _Matched],
     moves: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find regions of still places that the motion of matches in two reduced images contradicts.
 
-    Also returns the least motion of the scene's matches near each pixel, (H, W).
+    Returns (H, W) masks of regions that mostly do not move, and of those that stand exactly still;
+    and the least motion of the scene's matches near each pixel.
     """
-    nowhere = np.zeros(still.shape, bool), np.zeros(still.shape)
+    nowhere = (*np.zeros((2, *still.shape), bool), np.zeros(still.shape))
     _, labels = cv2.connectedComponents(np.uint8(widened(still, FRAME_MARGIN_PX)))
     shift, known = _shifts(*pair)
 
@@ -225,7 +227,7 @@ def _contradicted(
         np.uint8(widened(still & (exactly | ~known), FRAME_MARGIN_PX))
     )
     exact_px = np.bincount(parts[shown & exactly], minlength=parts.max() + 1)
-    return most[labels] | (exact_px >= WINDOW_PX**2)[parts], least
+    return most[labels], (exact_px >= WINDOW_PX**2)[parts], least
 
 
 def _shifts(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,8 +35,7 @@ MAX_FPS = 1000.0
 """If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
 EQUAL_FRAMES = 4
-"""After so many frames that are equal to the one before although their packets differ, another
-reader, whose memory holds no earlier frame, tells whether they really are."""
+"""If so many frames repeat the one before, another reader tells whether they really are equal."""
 
 SINGLE = "has a single frame: give a video, or a folder of frames"
 
@@ -155,7 +154,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             raise BatchError(f"none of {count} frames can be read", self.failures)
 
     def _from_capture(self) -> Iterator[Frame]:
-        last, equal, packets = np.empty(0), 0, _Packets(self.path)
+        last, equal, again = np.empty(0), 0, _SecondReader(self.path)
         for number in count():
             wanted = number % self.every == 0
             # `grab` skips a frame without decoding it, if the format allows it.
@@ -163,72 +162,46 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             if not done:
                 break
             if wanted:
-                rgb = load_image(bgr, channels="bgr")
-                same = not self.live and np.array_equal(rgb, last)
-                equal, last = equal + 1 if same else 0, rgb
-                if same:
-                    packets.check(number, equal, bgr, (self.count or number + 2) - 1)
-                else:
-                    packets.end()
-                yield Frame(number, rgb)
+                same = not self.live and np.array_equal(bgr, last)
+                equal, last = equal + 1 if same else 0, bgr
+                if equal == min(EQUAL_FRAMES, (self.count or number + 2) - 1):
+                    again.check(number, equal, bgr)
+                yield Frame(number, load_image(bgr, channels="bgr"))
         if number == 0:
             raise DeepDetectError("the source has no frames: check it with another program")
         if number == 1:
             raise DeepDetectError(f"{self.path} {SINGLE}")
         if equal and equal == (number - 1) // self.every:
-            packets.check(number - 1, equal, bgr, equal)
+            again.check(equal * self.every, equal, last, black=False)
 
     def __exit__(self, *_: object) -> None:
         if self._capture is not None:
             self._capture.release()
 
 
-class _Packets:
-    """The packets of a video, which tell whether equal frames should be equal.
+class _SecondReader:
+    """Another reader of a video, which tells whether equal frames really are equal.
 
     The conversion of interlaced frames fails in OpenCV 4.14 and 5.0, which then return the previous
-    contents of the memory. If the frames of a video are really equal, some of its packets are
-    equal, or packets only state that nothing changes; or another reader returns the same.
+    contents of the memory. That of the second reader is new, or holds another frame.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._read, self._grabbed = path, 0, 0
-        self.end()
-
-    def end(self) -> None:
-        """Begin anew where a frame differs from the one before."""
-        self._different: set[int] = set()
-        self._sure = False
+        self._path, self._grabbed = path, 0
 
     @cached_property
     def _video(self) -> Any:
-        return _undecoded(self._path)
-
-    @cached_property
-    def _other(self) -> Any:
         return cv2.VideoCapture(str(self._path))
 
-    def check(self, number: int, equal: int, bgr: np.ndarray, most: int) -> None:
+    def check(self, number: int, equal: int, bgr: np.ndarray, *, black: bool = True) -> None:
         """Raise an error if a frame, one of `equal` ones that repeat another, should not do so.
 
-        The video ends after `most`.
+        Unless it may be `black`, as new memory is.
         """
-        if self._sure:
-            return
-        for _ in range(self._read, number):
-            self._video.grab()
-        packet, self._read = self._video.read()[1], number + 1
-        # An encoder spends one bit on an unchanged block of 16x16 pixels; headers, up to 100 bytes.
-        if packet is not None and packet.size > bgr.size / 3 / 16**2 / 8 + 100:
-            self._different.add(hash(packet.tobytes()))
-        if len(self._different) < min(EQUAL_FRAMES, most):
-            return
         for _ in range(self._grabbed, number + 1):
-            self._other.grab()
-        self._grabbed = number + 1
-        same = np.array_equal(self._other.retrieve()[1], bgr)
-        self._sure = same and np.ptp(bgr) > 0  # new memory may hold zeros
-        if not self._sure:
+            self._video.grab()
+        self._grabbed = max(self._grabbed, number + 1)
+        if not np.array_equal(self._video.retrieve()[1], bgr) or not (black or bgr.any()):
             raise InvalidFileError(
                 f"{equal + 1} frames of {self._path}, up to number {number}, are equal, but should "
                 "not be: the installed OpenCV may fail with interlaced videos; convert it, such as "
