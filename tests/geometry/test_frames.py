@@ -54,6 +54,18 @@ def test_a_frame_of_any_colour_is_found_after_compression(shape, colour, scene) 
     inside = shape((400, 300)) > 0
     framed = np.where(inside[..., None], scene, np.uint8(colour))
     framed = cv2.imdecode(cv2.imencode(".jpg", framed, [cv2.IMWRITE_JPEG_QUALITY, 85])[1], 1)
+    require_frame(framed, inside, shape)
+
+
+@pytest.mark.parametrize("shape", [letter_box, pillar_box, round_rim])
+def test_a_noisy_frame_is_found(shape, scene) -> None:
+    inside = shape((400, 300)) > 0
+    framed = np.where(inside[..., None], scene, np.uint8((12, 20, 30)))
+    noise = np.random.default_rng(0).integers(-3, 4, framed.shape)
+    require_frame((framed + noise).clip(0, 255).astype(np.uint8), inside, shape)
+
+
+def require_frame(framed: np.ndarray, inside: np.ndarray, shape) -> None:
     found = uniform_frame(framed)
     assert found[~inside].mean() > (0.75 if shape is undistorted else 0.98)
     deep = cv2.erode(np.uint8(inside), np.ones((41, 41)), borderValue=1) > 0

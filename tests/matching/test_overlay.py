@@ -10,7 +10,8 @@ import pytest
 import skimage.data
 
 from deepdetect import PointDetector, match_images, register
-from deepdetect.matching.overlay import find_overlay
+from deepdetect.matching.guided import ImagePair
+from deepdetect.matching.overlay import find_overlay, still_matches
 
 WHITE = (255, 255, 255)
 
@@ -206,3 +207,25 @@ def test_a_caption_where_nothing_else_is_seen_to_move_is_told(shared: Path) -> N
         matches = match_images(*views)
     assert matches.geometry is not None
     assert matches.geometry.confidence == "fair" or matches.geometry.evidence.left_out > 0.01
+
+
+def test_matches_in_a_caption_before_a_plain_road_stand_still() -> None:
+    scene = cv2.resize(skimage.data.astronaut(), (640, 480), interpolation=cv2.INTER_AREA)
+    scene[380:] = 90
+    ahead = cv2.getRotationMatrix2D((320, 240), 0, 1.05)
+    views = [scene, cv2.warpAffine(scene, ahead, (640, 480), flags=cv2.INTER_CUBIC)]
+    y, x = np.mgrid[10:380:6, 10:630:6]
+    starts = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
+    ends = starts @ ahead[:, :2].T + ahead[:, 2]
+    plain, _ = still_matches(ImagePair((gray(views[0]), gray(views[1]))), starts, ends)
+    assert not plain.any()
+    for view in views:
+        cv2.putText(view, "12:04:31 CAM 1", (40, 460), cv2.FONT_HERSHEY_SIMPLEX, 1, WHITE, 2)
+    y, x = np.nonzero((views[0] == WHITE).all(axis=2)[440:])
+    standing = np.column_stack([x, y + 440])[::5].astype(np.float64)
+    pair = ImagePair((gray(compressed(views[0])), gray(compressed(views[1]))))
+    both = np.concatenate([starts, standing]), np.concatenate([ends, standing])
+    found, share = still_matches(pair, *both)
+    assert found[len(starts) :].mean() > 0.9
+    assert not found[: len(starts)].any()
+    assert 0 < share < 0.1
