@@ -154,17 +154,18 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             raise BatchError(f"none of {count} frames can be read", self.failures)
 
     def _from_capture(self) -> Iterator[Frame]:
-        last, equal, again = np.empty(0), 0, _SecondReader(self.path)
+        last: Any = None
+        equal, again = 0, _SecondReader(self.path)
         for number in count():
             wanted = number % self.every == 0
             # `grab` skips a frame without decoding it, if the format allows it.
-            done, bgr = self._capture.read() if wanted else (self._capture.grab(), None)
+            done, bgr = self._capture.read() if wanted else (self._capture.grab(), last)
             if not done:
                 break
             if wanted:
-                same = not self.live and np.array_equal(bgr, last)
+                same = not self.live and last is not None and np.array_equal(bgr, last)
                 equal, last = equal + 1 if same else 0, bgr
-                if equal == min(EQUAL_FRAMES, (self.count or number + 2) - 1):
+                if same and equal == min(EQUAL_FRAMES, (self.count or number + 2) - 1):
                     again.check(number, equal, bgr)
                 yield Frame(number, load_image(bgr, channels="bgr"))
         if number == 0:
