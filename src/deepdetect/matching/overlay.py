@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from .._shared.opencv import cv2
-from ..features.selection import check_ignore
+from ..features.selection import check_ignore, grid_subsample
 from ..geometry.frames import FRAME_MARGIN_PX, MIN_COMMON, filled_smoothly, uniform_frame, widened
 from ..geometry.images import BLUR_SIGMA_PX, gaussian_blur
 from ..geometry.transforms import scaled_points
@@ -110,12 +110,14 @@ def still_matches(
     if np.count_nonzero(still) < MIN_AREA_PX:
         return np.zeros(len(points0), bool), 0.0
     places, ends = (scaled_points(*each) for each in zip((points0, points1), scales, strict=True))
+    some = grid_subsample(places, WINDOW_PX)
+    few, there = places[some], ends[some]
     _, found, least = _contradicted(
-        still, small, lambda exactly: (places, ends, ~at_pixels(exactly, places))
+        still, small, lambda exactly: (few, there, ~at_pixels(exactly, few))
     )
     if found.any():  # matches around what stands still show nothing, because it attracts them
-        scene = ~at_pixels(widened(still, FRAME_MARGIN_PX), places)
-        _, found, least = _contradicted(still, small, lambda _: (places, ends, scene))
+        scene = ~at_pixels(widened(still, FRAME_MARGIN_PX), few)
+        _, found, least = _contradicted(still, small, lambda _: (few, there, scene))
     overlay = found & (least > MIN_MOTION_PX)
     slow = np.linalg.norm(ends - places, axis=1) < MIN_MOTION_PX
     return slow & at_pixels(overlay, places), float(overlay.mean())
