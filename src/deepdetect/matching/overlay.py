@@ -110,14 +110,15 @@ def still_matches(
     if np.count_nonzero(still) < MIN_AREA_PX:
         return np.zeros(len(points0), bool), 0.0
     places, ends = (scaled_points(*each) for each in zip((points0, points1), scales, strict=True))
-    some = grid_subsample(places, WINDOW_PX)
-    few, there = places[some], ends[some]
-    _, found, least = _contradicted(
-        still, small, lambda exactly: (few, there, ~at_pixels(exactly, few))
-    )
+
+    def outside(mask: np.ndarray) -> _Matched:
+        some = grid_subsample(places, WINDOW_PX)
+        return places[some], ends[some], ~at_pixels(mask, places[some])
+
+    _, found, least = _contradicted(still, small, outside)
     if found.any():  # matches around what stands still show nothing, because it attracts them
-        scene = ~at_pixels(widened(still, FRAME_MARGIN_PX), few)
-        _, found, least = _contradicted(still, small, lambda _: (few, there, scene))
+        around = widened(still, FRAME_MARGIN_PX)
+        _, found, least = _contradicted(still, small, lambda _: outside(around))
     overlay = found & (least > MIN_MOTION_PX)
     slow = np.linalg.norm(ends - places, axis=1) < MIN_MOTION_PX
     return slow & at_pixels(overlay, places), float(overlay.mean())
