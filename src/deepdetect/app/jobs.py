@@ -33,7 +33,7 @@ NO_RESULT = "the task ended without a result: there may be too little memory for
 @suggest_keywords
 @dataclass(frozen=True)
 class AppOptions:
-    """Limits of the server of the page.
+    """Limits of the local server that serves the app's page.
 
     Attributes:
         port: port of 127.0.0.1; 0 takes any free one.

@@ -155,7 +155,7 @@ def self_test() -> Iterator[Finding]:
     third = np.where(np.roll(near, -NEAR_SHIFT_PX, axis=1), behind, first)
     errors = []
     for image, shift, off in ((second, (6, 4), (0, 0)), (third, (0, 0), (NEAR_SHIFT_PX, 0))):
-        with warnings.catch_warnings(action="ignore"):  # the background stands still
+        with warnings.catch_warnings(action="ignore"):  # matching warns of still parts
             matches = match_images(first, image)
         column, row = np.rint(matches.points0).astype(int).T
         expected = np.array(shift) + near[row, column, :1] * np.array(off)

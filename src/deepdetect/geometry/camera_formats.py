@@ -291,7 +291,7 @@ def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
 def cameras_in(values: Any, image: Pair, form: Format) -> dict[str, Any] | None:
     """Return the cameras of a file in a dictionary with the keys of calib.json, or None.
 
-    Rectified projection matrices are preferred to other matrices, and these to single numbers.
+    Rectified projection matrices are preferred to other matrices, and any matrix to single numbers.
     """
     found: list[tuple[str, dict[str, Any], list[float]]] = []
     length, distorted = None, False

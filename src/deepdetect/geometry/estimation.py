@@ -31,7 +31,7 @@ MAX_LOG10_NFA = -6.0
 """A geometry is trusted if log10 of its number of false alarms is below this. Chosen by hand."""
 
 NEARBY_AREA = 16.0
-"""The matches near a model are those in this many times the area in which they agree with it."""
+"""Matches are near a model within this many times the area in which matches agree with it."""
 
 MAX_ORDERS = 100
 """Matches are tried in at most this number of orders. OpenCV 5.0 raised an error for 20 of 1,600
@@ -333,10 +333,10 @@ def log10_nfa(
 def log10_nfa_nearby(errors: np.ndarray, model: str, inlier_threshold: float) -> float:
     """Return the log10 NFA of a model among the matches near it, of which (M,) errors are given.
 
-    Matches that are wrong by some pixels, as of the vague shapes in images of two sensors, crowd
-    around the true geometry, and more of them agree with some warped one than of matches that end
-    anywhere. So the model must gather matches from `NEARBY_AREA` times the area in which they agree
-    with it.
+    Matches that are wrong by a few pixels, as on vague shapes in images of two sensors, lie near
+    the true geometry. So more of them agree with some distorted geometry than if they ended
+    anywhere. The model must therefore have more inliers than if the matches in `NEARBY_AREA` times
+    the area of agreement were spread evenly over it.
     """
     reach = NEARBY_AREA**0.5 if model == "homography" else NEARBY_AREA
     count, agreeing = (

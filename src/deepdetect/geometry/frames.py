@@ -10,9 +10,9 @@ from .._shared.opencv import cv2
 MAX_FRAME_NOISE, MIN_RING_SHARE, MIN_FRAME_SHARE, MIN_SCENE_SHARE = 12, 0.05, 0.002, 0.25
 MIN_SMOOTH_SHARE, MIN_NOISY_SHARE = 0.75, 0.5
 """Pixels of a frame differ from its colour by at most MAX_FRAME_NOISE grey levels per channel,
-about the noise of JPEG. At least MIN_RING_SHARE of the outermost pixels are exactly equal; or, if a
-frame is noisy, MIN_NOISY_SHARE are so much alike (9 of 3,447 photographs, half with a frame). Each
-part of the frame covers at least MIN_FRAME_SHARE of the image (one row of 500), the scene
+about the noise of JPEG. At least MIN_RING_SHARE of the outermost pixels are exactly equal or, in a
+noisy frame, MIN_NOISY_SHARE are within that noise (9 of 3,447 photographs, half with a frame). Each
+part of the frame covers at least MIN_FRAME_SHARE of the image (one row of 500), and the scene
 MIN_SCENE_SHARE: a portrait video covers 0.32 of a landscape one. The scene, or each part of the
 frame, comes within FRAME_MARGIN_PX of MIN_SMOOTH_SHARE of the outline of its convex hull: a scene
 may partly have the frame's colour, but a skyline reaches less of the outline."""
@@ -102,9 +102,9 @@ def widened(mask: np.ndarray, radius_px: int) -> np.ndarray:
 
 
 def with_flat_parts(overlay: np.ndarray, images: list[np.ndarray]) -> np.ndarray:
-    """Extend an (H, W) bool overlay by what is around it and equal in all (H, W, 3) uint8 images.
+    """Extend an (H, W) bool overlay by the areas around it that all (H, W, 3) uint8 images share.
 
-    Flat areas that continue to where images differ, as paper between letters does, are no part.
+    Flat areas that extend to places where images differ, as paper between letters, are not added.
     """
     equal = (np.ptp(images, axis=0) <= MAX_FRAME_NOISE).all(axis=2)
     steps = cv2.morphologyEx(images[0], cv2.MORPH_GRADIENT, np.ones((3, 3)))

@@ -12,7 +12,7 @@ from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
 ANTIALIASING_SIGMA = 0.5
-"""The blur before downscaling has a sigma of this times sqrt(1 / scale^2 - 1). Chosen by hand."""
+"""Sigma of the blur before downscaling, in sqrt(1 / scale^2 - 1) pixels. Chosen by hand."""
 
 WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25

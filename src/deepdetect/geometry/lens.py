@@ -22,9 +22,9 @@ distorted model fits better if the mean cost of matches falls by MIN_DEVIATIONS 
 (Vuong's test). 201 pinhole pairs have at most 4.3 (a street) and 1.9, fisheyes up to 25."""
 
 MIN_FLAT_DEVIATIONS, NEAR = 12.0, 3.0
-"""A distorted homography (of a plane, or a turned camera) must fit better by MIN_FLAT_DEVIATIONS if
-they are multiplied by the number of matches that fit it, within NEAR times `SCALE`, divided by that
-of a pinhole's epipolar lines. A curved cloth has 16 * 0.56, the lenses found 15 (GoPro) to 44."""
+"""A distorted homography (of a plane, or a turned camera) must fit better by MIN_FLAT_DEVIATIONS,
+also after multiplication by a ratio: its number of matches within NEAR times `SCALE`, over that of
+a pinhole's epipolar lines. A curved cloth has 16 * 0.56, the lenses found 15 (GoPro) to 44."""
 
 MIN_MATCHES = 30
 """Distortion is not estimated from fewer matches, because it may fit them by chance."""

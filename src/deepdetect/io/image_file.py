@@ -345,7 +345,7 @@ def identify(file: BinaryIO, name: str, formats: Iterable[str] = FORMATS) -> Any
     from PIL import Image
 
     _hide_warning_of_large_images()
-    Image.init()  # registers all formats; not every build of Pillow has AVIF
+    Image.init()  # registers the formats of this build of Pillow; some lack AVIF
     file.seek(0)
     start = file.read(SIGNATURE_BYTES)
     plugin = next((key for key, (begins, *_) in PLUGINS.items() if re.match(begins, start)), None)

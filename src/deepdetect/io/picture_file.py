@@ -364,7 +364,7 @@ def save_picture(
 ) -> None:
     """Write (H, W, 3) uint8 or uint16 RGB with its metadata as .png, .tif or .jpg, atomically.
 
-    JPEG files get 8 bits, for which uint16 pixels are scaled by `value_range` (black and white).
+    JPEG files have 8 bits: uint16 pixels are scaled so that `value_range` becomes black and white.
     """
     suffix = picture_suffix(path)
     if suffix.startswith(".tif"):

@@ -31,7 +31,7 @@ WINDOW_PX, MAX_DIFFERENCE, MIN_LIKENESS, MIN_GRADIENTS = 7, 0.3, 0.95, 32.0
 """A place looks the same in two images if, in a window of side WINDOW_PX, the difference of their
 gradients is below MAX_DIFFERENCE times the sum of both, or their correlation is above MIN_LIKENESS
 (letters before a brighter ground), and the sum is above MIN_GRADIENTS: 2 grey levels per pixel in
-each image, as Sobel's filter scales them. 313 pairs without overlays have none with either."""
+each image, as Sobel's filter scales them. Neither finds an overlay in 313 pairs without one."""
 
 MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
 """A match stands still if it moves by less than MAX_STILL_PX, about the error of a keypoint. The
@@ -41,8 +41,8 @@ MIN_MOTION_PX. At the end of a street, seen from a camera that drives along it, 
 MIN_AREA_PX, MIN_CLEAR_SHARE = 128, 0.67
 """A still region is an overlay if the scene clearly moves at the fraction MIN_CLEAR_SHARE of it,
 and if MIN_AREA_PX of its pixels (half a word of a caption) differ from where the scene moves to. A
-whole window of pixels that shift by less than MAX_SHIFT_PX is enough: of 177 real pairs, none has a
-pixel of these, a time stamp has 62, a car's bonnet 7,000."""
+whole window of pixels that shift by less than MAX_SHIFT_PX is enough: 177 real pairs have no
+such pixel, a time stamp has 62, a car's bonnet 7,000."""
 
 MAX_SHIFT_PX, MIN_UNITY, MIN_ROUNDNESS = 0.15, 0.6, 0.5
 """Distant parts of a scene, unlike overlays, shift as a whole: by more than MAX_SHIFT_PX, and by
@@ -104,7 +104,7 @@ def tell_still(share: float) -> None:
 def still_matches(
     pair: ImagePair, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return which matches stand still in an overlay that the others show, (K,) bool; its share."""
+    """Return which matches lie on a still overlay, (K,) bool, and its share of the image."""
     small, scales = pair.both(COMPARED_SIDE_PX)
     still = _same(*small) if pair.sizes[0] == pair.sizes[1] else np.zeros(1, bool)
     if np.count_nonzero(still) < MIN_AREA_PX:
@@ -206,7 +206,7 @@ def _contradicted(
             overlay[label] = whole < max(MAX_SHIFT_PX, MIN_UNITY * each)
         return overlay
 
-    if not stands(still & known).any():  # before the matching, which takes longest
+    if not stands(still & known).any():  # checked before the matching, which takes longest
         return nowhere
     exactly = still & known & (np.linalg.norm(shift, axis=2) < MAX_SHIFT_PX)
     places, ends, scene = matched(exactly)

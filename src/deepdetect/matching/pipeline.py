@@ -222,7 +222,7 @@ def match_features(
 
 
 def _noted(matches: Matches, left_out: float) -> Matches:
-    """Add the share that is left out. If it is the larger part, the scene is a guess."""
+    """Add the share of the image that is left out; above 1/2, lower "high" confidence to "fair"."""
     if (geometry := matches.geometry) is None:
         return matches
     evidence = replace(geometry.evidence, left_out=left_out + geometry.evidence.left_out)
@@ -294,7 +294,7 @@ def _require_pinholes(images: tuple[Any, Any], rgb: Points, *, rim: bool) -> Non
 
 
 def _unmasked(matches: Matches, pair: ImagePair, left_out: float) -> Matches:
-    """Drop matches in a mask, as guided ones may end there, or that stand still in an overlay."""
+    """Drop matches that end in a mask, as guided matches may, or that lie on a still overlay."""
     ends, masks = (matches.points0, matches.points1), pair.masks
     dropped = at_pixels(masks[0], ends[0]) | at_pixels(masks[1], ends[1])
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):

@@ -114,4 +114,4 @@ def _keep_what_is_read(graph: Any) -> None:
     for node in graph.get_ordered_ops():
         for value in node.outputs():
             if PADDED_IMAGE in value.get_names():
-                value.replace(graph.input(0))  # saves a copy of 12 bytes per pixel
+                value.replace(graph.input(0))  # avoids a copy with 12 bytes per pixel

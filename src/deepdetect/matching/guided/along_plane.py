@@ -1,9 +1,9 @@
-"""A plane: tracks make its homography exact and show parallax off it; it predicts dense matches.
+"""Refine the homography of a plane by tracks, find parallax off the plane, and match along it.
 
 The second image is warped by the homography of a plane. Corners and tentative matches are tracked
-to it. The homography of the plane with most tracks is fitted to them. It is cross-validated: the
-image is divided into the black and the white squares of a chessboard, and the fits to either colour
-must agree with no fewer tracks on the other than the homography before.
+the warped image. A homography is fitted to the largest set of tracks on one plane. To validate it,
+the image is divided like a chessboard: a fit to the black squares and a fit to the white ones must
+agree with no fewer tracks in the squares of the other colour than the initial homography does.
 
 If the homography does not explain a place of a static scene, the place is displaced along a line
 through the epipole (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant
@@ -29,27 +29,27 @@ MAX_SCALE_RATIO, the finer image is reduced further, at most to MIN_SCALE of its
 corners of different scales lie at different places. Lengths below are in reduced pixels."""
 
 CORNERS, WINDOW_PX, CELL_PX = 1500, 21, 16
-"""Maximum number of tracked corners, side of their windows, and of the squares from which one track
-each shows parallax."""
+"""Maximum number of tracked corners, side of the windows around them, and side of the squares in
+each of which one track is used to measure parallax."""
 
 MIN_TRACKS, SQUARES = 15, 8
 """A geometry is fitted to at least this number of tracks. The chessboard has this many squares
 along the longer side."""
 
 MAX_PARALLAX = 0.1
-"""Tentative matches farther from the plane than this fraction of the longer side are not tracked:
-the views are too unlike."""
+"""Tentative matches farther from the plane than this fraction of the longer side are not tracked,
+because the views differ too much there."""
 
 NOISE_PX = 1.0
-"""Tracks that miss the plane by less than this may be inexact. The error of tracks is a third."""
+"""Tracks nearer than this to the plane count as on it. The error of tracks is a third of this."""
 
 MAX_DISTANCE_PX = 1.0
 """A keypoint of the second image may be a partner if it is nearer than this to the place where the
 homography maps the keypoint of the first image: positions are whole pixels."""
 
 SAMPLES, MAX_ANGLE = 1000, 0.25
-"""Epipoles that are tried, and angle in radians between a displacement and its line that still
-agree: a third of the error of tracks for each pixel."""
+"""SAMPLES epipoles are tried. A displacement agrees with an epipole if it is within MAX_ANGLE
+radians of the line to it: the error of a track turns a displacement of 1 px by a similar angle."""
 
 MIN_ALIGNED, MIN_SHARE, MIN_FAR_SHARE = 0.8, 0.08, 0.02
 """A scene has depth if at least MIN_ALIGNED of the tracks off the plane agree with one epipole, and
@@ -70,7 +70,7 @@ NOTHING: Pair = np.empty((0, 2)), np.empty((0, 2))
 class PlaneTracks:
     """Corners and matches, (M, 2) in both images, tracked relative to the plane of a homography.
 
-    Corners start in the `free` ones of (rows, columns) bool squares of the first image, if given.
+    If `free`, (rows, columns) bool, is given, corners start only in the cells where it is true.
 
     Attributes:
         homography: (3, 3), fitted to the tracks if that makes it more exact.
@@ -106,7 +106,7 @@ class PlaneTracks:
             self._ends = transform_points(self._ends, np.linalg.inv(sharp))
 
     def _validated(self) -> bool:
-        """Return whether a fit to half of the squares brings no fewer others to the plane."""
+        """Return whether fits to squares of one colour suit no fewer tracks of the other colour."""
         starts, ends = self._starts, self._ends
         black = (starts // (self._side / SQUARES)).sum(axis=1) % 2 == 1
         gain = -np.count_nonzero(_on_plane(starts, ends))
@@ -118,11 +118,11 @@ class PlaneTracks:
         return bool(gain >= 0)
 
     def show_depth(self, foreground: bool = False, seed: int = 0) -> bool:
-        """Return whether the scene has depth, or, if asked, something clearly before its plane."""
+        """Return whether the scene has depth or, if `foreground`, an object far from its plane."""
         _, one = np.unique((self._starts // CELL_PX).astype(int), axis=0, return_index=True)
         places, moved = self._starts[one], (self._ends - self._starts)[one]
         length = np.linalg.norm(moved, axis=1)
-        # Less than a pixel of the second image, which may be foreshortened, is also noise.
+        # A motion below one pixel of the second image, which may be foreshortened, is also noise.
         seen = transform_points(self._ends[one], self._matrix)
         seen -= transform_points(places, self._matrix)
         length = np.minimum(length, np.linalg.norm(seen, axis=1))
@@ -142,7 +142,7 @@ class PlaneTracks:
 def match_along_plane(
     pair: ImagePair, pixels: Pair, homography: np.ndarray, judge: Judge, evidence: Evidence
 ) -> GuidedMatches:
-    """Match keypoints on integer pixels, (N, 2) and (M, 2), where the evidence explains them."""
+    """Match keypoints on integer pixels, (N, 2) and (M, 2), in the cells of `evidence.believed`."""
     predicted = transform_points(pixels[0], homography)
     indices1, distances = nearest_keypoints(predicted, pixels[1], pair.sizes[1])
     indices0 = np.flatnonzero(distances < MAX_DISTANCE_PX)
@@ -172,7 +172,7 @@ def _fitted(starts: np.ndarray, ends: np.ndarray, threshold_px: float) -> np.nda
 
 
 def _tracked(views: Pair, matrix: np.ndarray, matches: Pair, free: np.ndarray | None) -> Pair:
-    """Return (N, 2) starts of tracks in the first image, and their ends, moved there."""
+    """Track corners and matches; return (N, 2) starts and ends in the frame of the first image."""
     first, second = views
     warped, valid = warp_to_reference(second, matrix, first.shape[::-1], exact=True)
     inside = cv2.erode(valid.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX)), borderValue=0)
@@ -212,7 +212,7 @@ def _scales_at_centre(homography: np.ndarray, size: tuple[int, int]) -> tuple[fl
 
 
 def _agreeing(places: np.ndarray, moved: np.ndarray, side: int, seed: int) -> np.ndarray:
-    """Return which of (N, 2) motions agree with the epipole with which most agree, (N,) bool."""
+    """Find the epipole with which most of (N, 2) motions agree; return which agree, (N,) bool."""
     directions = moved / np.linalg.norm(moved, axis=1)[:, None]
     places = np.column_stack([places / side - 0.5, np.ones(len(places))])
     lines = np.cross(places, np.column_stack([directions, np.zeros(len(directions))]))

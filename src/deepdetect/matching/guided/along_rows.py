@@ -53,7 +53,7 @@ down if pixels times disparities exceed MAX_VOLUME, to bound time and memory; th
 in the frames themselves."""
 
 MAX_STEP_PX = 4.0
-"""If the whole range of disparities is searched in wider steps, the range near the plane is also
+"""If the step with which all disparities are searched exceeds this, those near the plane are also
 searched alone, in finer steps; the result with more matches is kept."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
@@ -64,7 +64,7 @@ CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
 """Side of the windows in which rectified views are correlated, and sigma of the preceding blur."""
 
 MAX_DISAGREEMENT_PX = 3.0
-"""A sparse match agrees with the disparity at its start if its own differs by less than this. The
+"""A sparse match agrees with the disparity map if their disparities differ by less than this. The
 limit is loose, because sparse matches come from another scale. Chosen on Oxford and others."""
 
 MIN_AGREEMENT = 0.6
@@ -135,7 +135,7 @@ def match_by_rectification(
 def _best_view(
     grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None
 ) -> tuple[RectifiedView, Pair] | None:
-    """Return the view that matches most, and its tracks: of all disparities, or near a plane."""
+    """Return the view with most matches, for all disparities or near a plane, and its tracks."""
     ways, best, most = [sparse], None, 0.0
     if plane is not None:
         reach_px = MAX_PARALLAX * max(grays[0].shape)
@@ -175,18 +175,18 @@ def rectified_view(
             return None
     starts, ends = (scaled_points(points, scale) for points in sparse)
     searched = _range_of_matches(frame, (starts, ends))
-    if searched[0] >= searched[1]:  # both views show nothing in common
+    if searched[0] >= searched[1]:  # the views show nothing in common
         return None
     (first, shown0), (second, shown1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
     disparity, matched, step_px = _match_rows((first, second), searched)
     correlation = _correlation((first, second), (shown0, shown1), disparity, matched)
-    # Chance gives as many correlations below 0 as above.
+    # By chance, as many correlations are below 0 as above; those below 0 are dropped.
     disparity = np.where(matched & (correlation >= 0), disparity, np.float32(np.nan))
     return RectifiedView(frame, scale, step_px, (first, second), disparity, correlation)
 
 
 def _volume(frame: RectifiedFrame, sparse: Pair) -> float:
-    """Return the number of pixels times that of disparities to search."""
+    """Return the number of pixels times the number of disparities to search."""
     low, high = _range_of_matches(frame, sparse)
     return float(np.prod(frame.size)) * (high - low + 1) if high > low else np.inf
 
@@ -203,9 +203,9 @@ def _frame(
 
 
 def _match_rows(views: Pair, searched: DisparityRange) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return (H, W) disparities, where they are matched, and the step with which they are searched.
+    """Return (H, W) disparities, the mask of matched pixels, and the step of the search in pixels.
 
-    They are searched in small copies, and refined in the views.
+    Disparities are searched in small copies of the views, and refined in the views themselves.
     """
     height, width = views[0].shape
     volume = height * width * (searched[1] - searched[0] + 1)

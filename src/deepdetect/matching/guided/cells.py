@@ -1,4 +1,4 @@
-"""Cells: both images of a pair on one grid of descriptors, on which geometries are compared."""
+"""Divide both images of a pair into cells with descriptors, by which geometries are compared."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ SIDE_PX = 480
 relative to the image. A homography that is off by 3 pixels at 640 still aligns them."""
 
 CELL_PX, SIZES_PX = 4, (2.5, 4.5)
-"""Cells are this many pixels apart and described by keypoints of these diameters, whose descriptors
-cover six times as much. With 3 and 6, edges of small planes are less sharp; with less, darkness
-and fog leave fewer cells."""
+"""Cells are CELL_PX pixels apart, and described by RootSIFT at two keypoint diameters, SIZES_PX. A
+descriptor covers six diameters. With 3 and 6, edges of small planes are less sharp; with smaller
+diameters, fewer cells remain in darkness and fog."""
 
 WINDOW_CELLS = 16
-"""Cells in a window of 16 pixels, the unit in which explained parts of the image are counted,
+"""Number of cells in a window of 16 x 16 pixels. Explained parts of images are counted in windows,
 because adjacent cells share most of their pixels."""
 
 MIN_WINDOWS_AROUND = 5
 """The place of a window is predicted if most of the eight windows around it hold matches."""
 
 MARGIN_PX = 9
-"""Cells closer than this to the border of an image, or to what is left out, are not compared: they
-see mostly the border. That two images end at the same place is no evidence."""
+"""Cells closer than this to the border of an image or of an ignored area are not compared: their
+descriptors mostly show the border, and borders at the same place are no evidence."""
 
 
 def enlarged(gray: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
@@ -41,7 +41,7 @@ def enlarged(gray: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
 
 
 def shown_parts(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Return where an image of a shape is not left out, (H, W) uint8."""
+    """Return (H, W) uint8: 1 where all pixels within `MARGIN_PX` exist and are not masked."""
     if mask is None:
         mask = np.zeros(shape, bool)
     left = cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -50,12 +50,12 @@ def shown_parts(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def at_cells(mask: np.ndarray) -> np.ndarray:
-    """Return an (H, W) mask at the cells."""
+    """Sample an (H, W) mask at the centres of the cells."""
     return mask[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
 
 
 def describe(gray: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return unit descriptors of all cells, (N, D) float32, 0 where nothing is, and their shape."""
+    """Return unit descriptors of all cells, (N, D) float32, 0 in flat cells, and their shape."""
     height, width = gray.shape
     x, y = (np.arange(CELL_PX // 2, side, CELL_PX) for side in (width, height))
     pixels = np.dstack(np.meshgrid(x, y)).reshape(-1, 2)
@@ -100,13 +100,13 @@ def gathered(
 
 
 def mean_gradient(gray: np.ndarray) -> np.ndarray:
-    """Return the mean difference of pixels two apart around each pixel."""
+    """Return the mean gradient around each pixel, as the difference of pixels two apart."""
     side = 3 * round(WINDOW_CELLS**0.5) * CELL_PX // 2
     return cv2.boxFilter(sift_gradient(gray)[0], -1, (side, side))
 
 
 def mean_around(values: np.ndarray) -> np.ndarray:
-    """Average each cell with those in the windows around its own; NaN stays NaN."""
+    """Average values over three by three windows around each cell; NaN stays NaN."""
     side = 3 * round(WINDOW_CELLS**0.5)
     known = np.isfinite(values)
     total, count = (
@@ -119,9 +119,9 @@ def mean_around(values: np.ndarray) -> np.ndarray:
 def predicted(
     points0: np.ndarray, points1: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where affine maps of the matches around each window place its pixels, and where known.
+    """Return the positions that matches predict for pixels, (H, W, 2) float32, and which are known.
 
-    The places are (H, W, 2) float32.
+    Each window is placed by an affine map, fitted to the matches in the eight windows around it.
     """
     side = CELL_PX * round(WINDOW_CELLS**0.5)
     rows, columns = (-(-length // side) for length in shape)

@@ -26,57 +26,57 @@ from .judge import Evidence, Judge, contradicts
 from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
 
 MIN_MATCHED_FRACTION = 0.02
-"""Dense matching has failed if it matches less than this fraction of the fewer keypoints."""
+"""Dense matching fails if it matches less than this fraction of the smaller set of keypoints."""
 
 MOST = 2 / 3
 """A scene has depth if a homography explains less than this fraction of the matches that agree with
-a fundamental matrix. The confidence is "high" only if as many of all matches follow one geometry:
-the others lie on what moves differently."""
+a fundamental matrix. The confidence is "high" only if at least this fraction of all matches follows
+the first geometry, because the other matches lie on objects that move differently."""
 
 NEARLY_ALL = 0.9
-"""A plane that explains this fraction of what both images show may explain only half of the
-matches, because those from one period of a pattern to another also lie on epipolar lines. One that
-explains less may leave out something that stands before it."""
+"""If a plane explains this fraction of the compared cells, only half of the fundamental matrix's
+inliers, not `MOST`, must fit the plane: matches to a wrong period of a pattern also lie on epipolar
+lines. If the plane explains less, an object in front of it is also looked for."""
 
 MAX_NEARBY_LOG10_NFA = -3.0
-"""Without dense matches, sparse ones are an answer if the log10 number of false alarms of those
-that move is below HIGH_LOG10_NFA, and below this among the matches nearby. Those that stand still
-may come from the borders, which descriptors see, or from a frame. Wrong ones of 40 sparse answers
-reach -2.3 among the matches nearby."""
+"""Without dense matches, sparse matches suffice if the log10 NFA of their geometry is below
+HIGH_LOG10_NFA, and its log10 NFA among nearby matches (`log10_nfa_nearby`) is below this. Matches
+that stand still are not counted, because they may come from a frame or from the image borders,
+which descriptors see. The wrong ones of 40 sparse answers reach -2.3 among nearby matches."""
 
 MIN_KEPT = 0.8
-"""Depth also wins over a plane if it explains this fraction of what it compares of the plane."""
+"""Depth also wins over a plane if it explains this fraction of the plane's cells it can compare."""
 
 OFF_RATIO = 4.0
-"""Tentative matches with errors above this multiple of the inlier threshold are not explained."""
+"""Further layers come from matches with errors above this multiple of the inlier threshold."""
 
 MIN_CHOSEN = 0.75
-"""If this fraction of the tentative matches agrees with a plane, descriptors tell the periods of a
-repeated pattern apart. On printed circuit boards, the fraction is 0.45 to 0.9, on 30 made facades
-with windows that are all alike up to 0.68."""
+"""If this fraction of the tentative matches agrees with a plane, the plane is accepted although a
+displaced copy fits as well, because descriptors tell the periods of the pattern apart. The fraction
+is 0.45 to 0.9 on circuit boards, and up to 0.68 on 30 synthetic facades with identical windows."""
 
 MIN_GAIN = 1.05
-"""A plane moves on its own if it and a fundamental matrix of the rest alone fit this many times as
-many matches as the matrix of all, and this one fits less than a third of those on the plane."""
+"""A plane moves on its own if it and a fundamental matrix F of other matches fit this many times
+as many matches as one matrix for all, and F fits less than a third of the plane's matches."""
 
 MAX_STILL = 0.005
-"""A homography that moves the corners by less than this fraction of the longer side stands still: 3
-pixels of 640 are its inlier threshold."""
+"""A homography is still if it moves all corners by less than this fraction of the longer side. At
+640 pixels, this is about the inlier threshold of a homography, 3 pixels."""
 
 MIN_MOVING = 0.5
-"""What stands still (a caption, a part of the vehicle) is left out if a moving geometry explains at
-least this many times as many windows. With less, something moves before a still camera."""
+"""Still layers (a caption, a part of the vehicle) are left out if a moving layer explains at least
+this many times as many windows. Otherwise, an object moves in front of a still camera."""
 
 MAX_LAYERS = 4
-"""Maximum number of geometries of one pair: one of the scene, others of what moves on its own."""
+"""Maximum number of geometries of one pair: one of the scene, the others of moving objects."""
 
 HIGH_SHARE, HIGH_LOG10_NFA = 0.2, -12.0
 """The confidence is "high" only if the images confirm at least HIGH_SHARE of the compared cells and
 the log10 number of false alarms of the sparse matches is below HIGH_LOG10_NFA."""
 
 SCENE_MATCHES, DOMINANT_FRACTION = 1000, 0.5
-"""A plane is dominant if DOMINANT_FRACTION of SCENE_MATCHES random dense matches or more lie on it,
-which makes it the largest part of the scene."""
+"""A plane is dominant if at least DOMINANT_FRACTION of the dense matches, of which SCENE_MATCHES
+are drawn at random, lie on it: it is then the largest part of the scene."""
 
 
 NO_MATCHES = GuidedMatches(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.float32))
@@ -84,7 +84,7 @@ NO_MATCHES = GuidedMatches(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """What one geometry explains; a displaced copy explains as much as a `repeated` plane."""
+    """A geometry, its matches and evidence. If `repeated`, a displaced copy explains as much."""
 
     hypothesis: Hypothesis
     matches: GuidedMatches
@@ -115,7 +115,7 @@ class Explanation:
 
     @cached_property
     def layers(self) -> list[Layer]:
-        """The layers."""
+        """The layers, the one that explains most first; empty if no geometry can be trusted."""
         layers: list[Layer] = []
         fallback: Layer | None = None
         for tentative in self._sources:
@@ -126,7 +126,7 @@ class Explanation:
             if found is None or (
                 fallback is not None and found.hypothesis.log10_nfa > fallback.hypothesis.log10_nfa
             ):
-                continue  # what explains more is better, also without the images
+                continue  # nothing is found, or an earlier source gave a better fallback
             if found.evidence.confirms:
                 layers.append(found)
                 break
@@ -201,7 +201,7 @@ class Explanation:
                 flat = layer
                 break
         if epipolar is not None and _mostly(chance, epipolar.inliers, 1 / 3):
-            epipolar = None  # it explains what is seen at the borders
+            epipolar = None  # it fits matches whose planes explain no more than chance
         pattern = epipolar is not None and _mostly(refuted, epipolar.inliers, 1 / 2)
         part = None
         if epipolar is not None and flat is not None:
@@ -237,7 +237,7 @@ class Explanation:
     def _seen_plane(
         self, plane: Hypothesis, epipolar: Hypothesis | None, free: np.ndarray | None
     ) -> Layer:
-        """Return what a plane explains once it is exact."""
+        """Refine the homography of a plane by tracks; return the layer of what it explains."""
         pair, judge = self._seen(plane.tentative.cross_modal)
         agreeing = plane.inliers if epipolar is None else plane.inliers | epipolar.inliers
         some = plane.tentative.chosen(agreeing)
@@ -250,13 +250,13 @@ class Explanation:
         return Layer(exact, matches, evidence, tracks, evidence.confirms and view.repeated)
 
     def _apart(self, flats: Sequence[Hypothesis], epipolar: Hypothesis) -> Hypothesis:
-        """Return the geometry of what is off a plane, if a plane moves on its own."""
+        """Return the geometry of the matches off a plane that moves on its own, or `epipolar`."""
         for plane in flats:
             tentative = plane.tentative
             off = plane.errors(tentative.points0, tentative.points1) > 2 * plane.threshold_px
             rest = propose(self._pair, tentative.chosen(off), "fundamental", self._seed)
             if rest is None or 3 * np.count_nonzero(rest.inliers) < np.count_nonzero(plane.inliers):
-                continue  # a post before a wall fits to many matrices
+                continue  # few matches, as on a post before a wall, fit many matrices
             inliers = np.zeros(len(off), bool)
             inliers[np.flatnonzero(off)[rest.inliers]] = True
             along = rest.errors(*plane.points) < 2 * rest.threshold_px
@@ -268,7 +268,7 @@ class Explanation:
     def _along_rows(
         self, epipolar: Hypothesis, plane: Layer | None, free: np.ndarray | None
     ) -> Layer | None:
-        """Match along epipolar lines, also in images that a plane makes alike; None if rejected."""
+        """Match along epipolar lines, perhaps after a warp by `plane`; None if rejected."""
         pair, judge = self._seen(epipolar.tentative.cross_modal)
         count, lattice = len(self.pixels[0]), judge.lattice()
         everywhere = np.concatenate([self.pixels[0], lattice])
@@ -282,7 +282,7 @@ class Explanation:
         own = both.indices0 < count
         matches = both.chosen(own)
         starts = matches.starts(self.pixels[0])
-        # The lattice is judged, so that the answer does not depend on where keypoints are.
+        # Matches of a regular lattice are judged, so that the positions of keypoints do not matter.
         view = judge.along_matches(everywhere[both.indices0[~own]], both.points1[~own])
         evidence = self._on_free(view.evidence, free)
         if not evidence.confirms or view.repeated:
@@ -332,7 +332,7 @@ class Explanation:
             return TwoViewGeometry("none", evidence=evidence), None
         first = self.layers[0]
         own = first.hypothesis
-        planes_move = own.model == "homography" and len(self.layers) > 1  # which passes for a lens
+        planes_move = own.model == "homography" and len(self.layers) > 1  # this can mimic a lens
         if self._asked != "homography" and not planes_move:
             straight_lines(self._pair, own)
         matches = first.matches
@@ -375,7 +375,7 @@ class Explanation:
         least = HIGH_SHARE if len(self.layers) == 1 else MOST
         unlike = contradicts(seen)
         if own.model == "homography" and stands_still(own.matrix, self._pair.sizes):
-            unlike |= seen.agreement < NEARLY_ALL  # as behind an overlay
+            unlike |= seen.agreement < NEARLY_ALL  # the still part may be an overlay
         strong = seen.share >= least and own.log10_nfa < HIGH_LOG10_NFA
         before = layer.tracks is not None and layer.tracks.show_depth(True, self._seed)
         return seen.confirms and strong and not (layer.repeated or unlike or before)
@@ -428,7 +428,7 @@ def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
 
 
 def _copies(plane: Layer, other: Layer) -> bool:
-    """Return whether a plane explains less than another, and mostly the same parts of the image."""
+    """Return whether a layer explains no more than another, and mostly cells of the other."""
     both = plane.evidence.explained & other.evidence.explained
     least = np.count_nonzero(plane.evidence.explained) / 2
     fewer = plane.evidence.windows <= other.evidence.windows
@@ -436,12 +436,12 @@ def _copies(plane: Layer, other: Layer) -> bool:
 
 
 def _wins(deep: Layer, plane: Layer) -> bool:
-    """Return whether depth explains half of what a plane does, or most that both compare."""
+    """Return whether depth explains half as many windows as a plane, or `MIN_KEPT` of its cells."""
     compared = plane.evidence.explained & np.isfinite(deep.evidence.similarity)
     kept = compared.any() and _mostly(compared & deep.evidence.explained, compared, MIN_KEPT)
     return bool(kept) or deep.evidence.windows >= plane.evidence.windows / 2
 
 
 def _mostly(some: np.ndarray, inliers: np.ndarray, least: float = MOST) -> bool:
-    """Return whether `some` matches are as many as a fraction of other `inliers`."""
+    """Return whether the number of `some` is at least `least` times the number of `inliers`."""
     return bool(np.count_nonzero(some) >= least * np.count_nonzero(inliers))

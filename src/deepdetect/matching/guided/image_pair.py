@@ -1,4 +1,4 @@
-"""A pair of images, of which everything is made only once."""
+"""A pair of images, which caches everything that is computed from each image."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ImagePair:
         return other
 
     def once(self, side: int, key: Hashable, make: Callable[[], T]) -> T:
-        """Return what `make` makes of image number `side`; it is called once for each `key`."""
+        """Return the result of `make` for image number `side`, which is cached under `key`."""
         made = self._made[side]
         if key not in made:
             made[key] = make()

@@ -1,4 +1,4 @@
-"""The one judge of geometries: the images agree with a geometry more than with displaced copies.
+"""Judge geometries: images must agree with a geometry more than with displaced copies of it.
 
 A geometry warps the second image into the frame of the first. Both are divided into cells. RootSIFT
 descriptors of both images at each cell correlate where they show the same place. A cell is
@@ -50,21 +50,21 @@ correlations by less than noise and takes a quarter of the time."""
 
 FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
 """A cell is explained if less than FALSE_POSITIVE_RATE of the cells of displaced copies correlate
-as well, and contradicted if its surroundings correlate no better than CONTRADICTING_RATE of theirs:
-doubting one cell needs less evidence than believing it."""
+as well. It is contradicted if at least CONTRADICTING_RATE of those have surroundings that correlate
+as well as its own: the limit is looser, because doubt needs less evidence than belief."""
 
 FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
 """The second image shifted by plus or minus these fractions of its width and height gives the
 correlations that occur by chance in this pair."""
 
 MIN_PERIOD = 3
-"""Displacements of fewer cells are no copies, because descriptors of aligned images overlap."""
+"""Displacements by fewer cells give no copies, because descriptors of nearby cells overlap."""
 
 MIN_SIMILARITY, MAX_COPIES, MIN_OVERLAP = 0.4, 4, 0.5
 """A displaced copy is compared with a geometry if its correlation over the whole image is at least
 MIN_SIMILARITY times the geometry's, and MIN_OVERLAP of the overlap remains. Planes of Oxford have
-copies of up to 0.3, facades of one repeated window 0.6 or more. A lattice has MAX_COPIES
-nearest copies."""
+copies of up to 0.3, facades of one repeated window 0.6 or more. At most MAX_COPIES are compared,
+because a lattice has four nearest copies."""
 
 MIN_WON, MIN_WON_RATIO = 0.0125, 1.5
 """A geometry must explain at least MIN_WON of its cells clearly better than a displaced copy does,
@@ -73,12 +73,12 @@ unlike the others, the fraction is 0.03 or more, on a truss 0.017; if all window
 to 0.012 for some copy, and 0.002 without the frames of the images."""
 
 MIN_TIED = 0.5
-"""A copy competes with a geometry if it explains at least this fraction of its cells as well. One
-that explains only the road of a street competes with nothing."""
+"""A copy competes with a geometry if it explains at least this fraction of the geometry's cells as
+well. A copy that explains only the road of a street does not compete."""
 
 MIN_STRUCTURE, MIN_GRADIENT = 0.5, 4.0
-"""Limits of the mean difference of pixels two apart, in grey levels. What is below MIN_STRUCTURE in
-both images is flat and not compared. What is above MIN_GRADIENT in both shows more than noise:
+"""Limits of the mean difference of pixels two apart, in grey levels. Places below MIN_STRUCTURE in
+both images are flat and not compared. Places above MIN_GRADIENT in both show more than noise:
 noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
 
 MIN_WINDOWS, MIN_SHARE = 8.0, 0.1
@@ -113,15 +113,15 @@ class Evidence:
 
     @cached_property
     def explained(self) -> np.ndarray:
-        """(rows, columns) bool, where the geometry explains the image."""
+        """(rows, columns) bool, true in the cells that the geometry explains."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.similarity > self.bound)
 
     @cached_property
     def believed(self) -> np.ndarray:
-        """(rows, columns) bool, where matches are believed: at the border, as next to it.
+        """(rows, columns) bool, true in the cells whose matches are kept: the explained ones.
 
-        If too little is compared, they are believed everywhere, as their geometry is.
+        At the border, explained cells nearby decide. If too little is compared, all are kept.
         """
         if not self.compares:
             return np.ones(self.similarity.shape, bool)
@@ -131,7 +131,7 @@ class Evidence:
 
     @property
     def compares(self) -> bool:
-        """Whether enough is compared to believe the geometry or to doubt it."""
+        """Whether enough cells are compared to trust the geometry or to doubt it."""
         compared = np.count_nonzero(np.isfinite(self.similarity))
         return bool(compared >= MIN_WINDOWS * WINDOW_CELLS)
 
@@ -157,12 +157,12 @@ class Evidence:
 
     @property
     def confirms(self) -> bool:
-        """Whether enough of the image is explained to believe the geometry."""
+        """Whether the number and the fraction of explained cells suffice to trust the geometry."""
         return self.windows >= MIN_WINDOWS and self.share >= MIN_SHARE
 
     @property
     def is_chance(self) -> bool:
-        """Whether much is compared, and no more than twice as much explained as chance explains."""
+        """Whether many cells are compared, and chance explains over half of the explained ones."""
         compared = np.count_nonzero(np.isfinite(self.similarity)) / WINDOW_CELLS
         return bool(compared > MIN_WINDOWS / MIN_SHARE and self.share < 2 * FALSE_POSITIVE_RATE)
 
@@ -174,7 +174,7 @@ class Evidence:
 
 
 def contradicts(evidence: Evidence | PublicEvidence) -> bool:
-    """Return whether much of the images is unlike what a geometry says."""
+    """Return whether the images contradict a geometry (see `MIN_AGREEMENT`)."""
     clear = evidence.correlation >= CLEAR_CORRELATION
     return evidence.agreement < MIN_AGREEMENT and not clear
 
@@ -194,7 +194,7 @@ class Judge:
 
     @cached_property
     def _described(self) -> tuple[np.ndarray, np.ndarray]:
-        """PCA axes of the first image's descriptors, and these reduced, (rows, columns, D)."""
+        """PCA axes of the first image's descriptors, and their coordinates, (rows, columns, D)."""
         cells, shape = describe(self._first)
         axes = np.linalg.eigh(cells.T @ cells)[1][:, -DIMENSIONS:]
         return axes, (cells @ axes).reshape(*shape, DIMENSIONS)
@@ -221,7 +221,7 @@ class Judge:
         return np.rint(points).astype(np.float32)
 
     def along_plane(self, homography: np.ndarray) -> View:
-        """Return the second image as a homography places it in the frame of the first."""
+        """Return the second image, warped to the frame of the first by a homography."""
         matrix, size = scaled_homography(homography, *self._scales), self._first.shape[::-1]
         nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
         valid = cv2.warpPerspective(self._shown[1], matrix, size, flags=nearest) > 0
@@ -229,10 +229,10 @@ class Judge:
         return self._view(cv2.warpPerspective(self._second, matrix, size, **how), valid)
 
     def along_matches(self, points0: np.ndarray, points1: np.ndarray) -> View:
-        """Return the second image as matches place it in the frame of the first.
+        """Return the second image, warped to the frame of the first by matches.
 
-        The matches *around* each window place it, not those inside it, so it shows the same content
-        only if the matches are correct.
+        Each window is placed by the matches *around* it, not by those inside it, so it shows the
+        content of the first image only if the matches are correct.
         """
         points0, points1 = (
             scaled_points(points, scale)
@@ -281,9 +281,9 @@ class View:
         if len(chance) < WINDOW_CELLS:
             nowhere = np.zeros(self._valid.shape, bool)
             return Evidence(np.full(self._valid.shape, np.nan), 1.0, 1.0, nowhere, nowhere)
-        # Copies that happen to be displaced by the period of a pattern are outvoted.
+        # The median discards copies that happen to be displaced by the period of a pattern.
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # copies that show nothing
+            warnings.simplefilter("ignore", RuntimeWarning)  # for copies without a cell
             bounds = [np.nanquantile(each, 1 - FALSE_POSITIVE_RATE) for each in far]
         bound = float(np.nanmedian(bounds))
         own = self._displaced(0, 0)
@@ -337,7 +337,7 @@ class View:
         return False
 
     def _moved(self, image: np.ndarray, valid: np.ndarray, move: np.ndarray) -> np.ndarray:
-        """Correlate the first image with another in its frame, moved by a homography of cells."""
+        """Correlate the first image with an image that is moved by a homography between cells."""
         to_cells = np.array([[1 / CELL_PX, 0, 0], [0, 1 / CELL_PX, 0], [0, 0, 1]])
         to_cells[:2, 2] = -(CELL_PX // 2) / CELL_PX
         matrix, size = np.linalg.inv(to_cells) @ move @ to_cells, image.shape[::-1]
@@ -360,7 +360,7 @@ class View:
         rows, columns = self._valid.shape
         size = cv2.getOptimalDFTSize(2 * rows), cv2.getOptimalDFTSize(2 * columns)
         valid = self._valid.astype(np.float64)
-        some = slice(-24, None)  # enough to find periods
+        some = slice(-24, None)  # these components suffice to find periods
         first, second = (
             np.fft.rfft2(cells[..., some], size, axes=(0, 1))
             for cells in (self._first, self._second * self._valid[..., None])

@@ -28,18 +28,18 @@ from .simulated_views import simulated_views
 
 LEARNED_SIDE_PX, LEARNED_KEYPOINTS = 640, 2048
 """The first source reduces the images to this longer side and finds this number of points in each.
-They give a geometry for all pairs of Oxford but bark 1-6, and for half of the other hard ones."""
+They give a geometry for all pairs of Oxford but bark 1-6, and for half of the other hard pairs."""
 
 DENSE_SIDE_PX, DENSE_KEYPOINTS = 1280, 8192
-"""The second source uses larger images and more points than the first, which finds twice as many
-correct matches where few are correct."""
+"""The second source uses larger images and more points than the first. It finds twice as many
+correct matches on pairs where few matches are correct."""
 
 GIVEN_SIDE_PX = 1200
-"""Positions of the caller are taken to be as exact as in images of this longer side."""
+"""Matches that the caller gives are assumed to be as exact as in images of this longer side."""
 
 VIEWED_SIDE_PX, VIEWED_KEYPOINTS = 320, 1000
-"""Oblique views are simulated from images of this side with this number of points, and have half
-as many: 16 views then take as long as the source before."""
+"""Images of this longer side with this number of points are compared with oblique views of the
+other image, which have half as many points: 16 views then take as long as the source before."""
 
 TENTATIVE_RATIO = 0.95
 """Limit of the ratio test of learned descriptors here. It is looser than that of matches by
@@ -51,8 +51,8 @@ SEPARATION_PX = 2.0
 because one corner that is found twice is no further evidence."""
 
 MAX_PLANES = 3
-"""This number of homographies are tried at most, each from the matches that are left. A facade
-that is off by one window in either direction takes two."""
+"""Maximum number of homographies that are tried, each from the matches that fit none before. On a
+facade, two may be wrong by one window, one in either direction."""
 
 MIN_MATCHES = 8
 """A geometry needs more matches than the seven that any fundamental matrix fits."""
@@ -124,7 +124,7 @@ class Hypothesis:
 
 
 class Sources:
-    """Tentative matches of a pair, each source asked only once, and only when it is wanted."""
+    """The sources of tentative matches of a pair, cheapest first; each computes them on demand."""
 
     def __init__(self, pair: ImagePair, given: Pair | None = None) -> None:
         self._pair, self._given = pair, given
@@ -139,7 +139,7 @@ class Sources:
 
     @cached_property
     def learned(self) -> Tentative:
-        """Matches of learned points of small copies."""
+        """Matches of learned points in small copies of the images."""
         return self._matched(self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS), LEARNED_SIDE_PX)
 
     def _extract(self, side_px: int, keypoints: int) -> tuple[Keypoints, Keypoints]:
@@ -172,7 +172,7 @@ class Sources:
 
     @cached_property
     def dense(self) -> Tentative:
-        """Matches of many learned points."""
+        """Matches of many learned points in larger copies of the images."""
         return self._matched(self._extract(DENSE_SIDE_PX, DENSE_KEYPOINTS), DENSE_SIDE_PX)
 
     def _views(self) -> Tentative:

@@ -100,7 +100,7 @@ def _given(images: Images) -> Images:
 def _plane(
     photographs: Photographs, number: int, share: float, rectified: bool
 ) -> tuple[Images, np.ndarray, np.ndarray]:
-    """Render a plane into two views; return views, homography, and the mask in the first view."""
+    """Render a plane into two views; return both, its homography and its mask in the first view."""
     rng = np.random.default_rng([0, number])
     texture = load_image(photographs.planes[rng.integers(len(photographs.planes))])
     if rectified:

@@ -31,7 +31,7 @@ KINDS = ("zoom", "blur", "viewpoint", "light")
 
 BORDER_PX = 4
 """Pixels of a view are not valid near the photograph's border, because mirrored pixels are close.
-The margin is this number of pixels of the photograph, plus as many pixels of the view."""
+The margin is the sum of this many pixels of the photograph and this many pixels of the view."""
 
 SUPERSAMPLING = 2
 """Views are rendered with twice the pixels along each side, so that they are not aliased."""
