@@ -10,8 +10,8 @@ Focal lengths and positions are in pixels, and the centre of the first pixel is 
      "disparity_offset_px": 66.7,   cx right minus cx left; default: computed from the values of cx
      "left": {...}, "right": {...}} values for one view only: focal_px, cx, cy, width, height
 
-Without `baseline_mm`, lengths are in multiples of the baseline. Numbers other than 0 under other
-keys raise an error, because distortion would be lost. Other texts and objects are ignored.
+Without `baseline_mm`, lengths are in multiples of the baseline. An unknown key with a number other
+than 0 is an error, because it may be a lens distortion. Unknown texts and objects are ignored.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .transforms import outer_corners
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
-"""Maximum difference of a stated disparity offset from cx right minus cx left. Chosen by hand."""
+"""A `disparity_offset_px` farther from cx right minus cx left is an error. Chosen by hand."""
 
 
 @suggest_keywords
@@ -311,7 +311,7 @@ def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
 def fundamental_matrix(
     calibration: Calibration, rotation: np.ndarray, translation: np.ndarray
 ) -> np.ndarray:
-    """Return (3, 3) F for X1 = rotation @ X0 + translation: x1^T F x0 = 0 for matches in pixels."""
+    """Return the (3, 3) F of the pose X1 = rotation @ X0 + translation; x1^T F x0 = 0 in pixels."""
     essential = cross_matrix(translation) @ rotation
     inverse0 = np.linalg.inv(calibration.camera0.matrix)
     return np.linalg.inv(calibration.camera1.matrix).T @ essential @ inverse0
@@ -370,7 +370,7 @@ class PosedView:
 
 def camera_spacing(centres: np.ndarray) -> float:
     """Return the median distance from a camera to its nearest neighbour; `centres` is (V, 3)."""
-    blocks = np.array_split(centres, len(centres) // 500 + 1)  # blocks limit the use of memory
+    blocks = np.array_split(centres, len(centres) // 500 + 1)  # blocks, to save memory
     distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
     second = min(1, len(centres) - 1)  # index 0 is the camera itself
     nearest = [np.partition(each, second, axis=1)[:, second] for each in distances]

@@ -107,7 +107,7 @@ def _parsed(content: bytes) -> Values:
 
 
 def _yaml(text: str) -> Any:
-    """Parse YAML with OpenCV's tags; None for other text. "Camera.fx" becomes "fx" of "Camera"."""
+    """Parse YAML with OpenCV's tags, or return None. A key "Camera.fx" becomes "fx" in "Camera"."""
     import yaml
 
     Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # a subclass, to accept OpenCV's tags

@@ -26,12 +26,12 @@ MM_PER_M = 1000.0
 MM_PER_CM = 10.0
 
 METRES_BELOW, MM_FROM = 1.0, 30.0
-"""A baseline without a unit is in metres if it is below METRES_BELOW, and in mm from MM_FROM on. A
-number in between may be in cm, or in squares of a chessboard, which OpenCV's example counts."""
+"""A baseline without a unit is taken as metres below METRES_BELOW, as mm from MM_FROM on. A number
+between the two is left out: it may be in cm, or in chessboard squares as in OpenCV's example."""
 
 ROUNDING = 1e-9
-"""Distortion coefficients up to this are zeros with rounding errors, because even at the corner of
-a large image they would move a pixel by less than a ten-thousandth."""
+"""Distortion coefficients up to this count as 0 with a rounding error: even in the corner of a
+large image, they would move a point by less than a ten-thousandth of a pixel."""
 
 MIN_FOCAL = 0.1
 """A focal length under this fraction of the image's longer side is rejected as not being in pixels,
@@ -50,7 +50,7 @@ SIZES = (
     *(("width", "height"), ("w", "h"), ("cols", "rows"), ("imagewidth", "imageheight")),
     *(("resolution",), ("imagedimension",)),
 )
-"""Names of values in other programs, as `short` returns them."""
+"""Names of matrices, focal lengths, principal points and image sizes in files, made `short`."""
 SIZE_NAMES = {name for names in SIZES for name in names}
 
 MODELS = re.compile(r"(distortion)?(model|type)|modeltype|projection(type)?|poly.*name")
@@ -69,7 +69,7 @@ CROPS = re.compile(r"[xy]_offset|binning_[xy]")
 BASELINES = re.compile(
     r"(?:stereo)?baseline(?:in)?(?:(mm|millimet\w+)|(cm|centimet\w+)|(m|met\w+))?"
 )
-"""Names of distortion coefficients, crops of the sensor, and baselines (mm, cm, m, no unit)."""
+"""Names of distortion coefficients, sensor crops, and baselines in mm, cm, m or without a unit."""
 
 ZED_SIZES = {
     **{"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200)},
@@ -82,8 +82,8 @@ class Format(NamedTuple):
     """A file format: its name, a pattern that one of its keys matches, and its reader, if needed.
 
     `first` is the x and y of the first pixel's centre; None means 0, or 1 for MATLAB's transposed
-    matrix. "middle": principal points are relative to the image centre. "fractions": they are
-    relative to the image centre, in fractions of the longer side.
+    matrix. If it is "middle", principal points are relative to the image centre. If "fractions",
+    they also are, and they and focal lengths are in fractions of the longer side.
     """
 
     name: str
@@ -99,7 +99,7 @@ def short(key: Any) -> str:
 
 
 def numbers_in(value: Any) -> list[float]:
-    """Return the numbers of nested lists, objects and text; none for booleans and other text."""
+    """Return all numbers in a text, list or object, also a nested one; booleans are not numbers."""
     if isinstance(value, bytes) or (isinstance(value, str) and value.startswith("$base64$")):
         raise ReconstructionError("it has its numbers in base64: write it without base64")
     if isinstance(value, str):
@@ -116,7 +116,7 @@ def numbers_in(value: Any) -> list[float]:
 
 
 def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
-    """Return a matrix whose number of elements is in `sizes`, as three rows; otherwise None."""
+    """Return a matrix as three rows, or None if its number of elements is not in `sizes`."""
     nested = value[0] if isinstance(value, list) and value else value
     if isinstance(nested, Mapping) and "data" not in nested:
         return None
@@ -129,7 +129,7 @@ def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
 
 
 def matrices(values: Values, name: str, *sizes: int) -> list[np.ndarray]:
-    """Return the matrices of the left and right camera, by their keys, or the first matrix."""
+    """Return the two matrices whose keys say left and right, or else a list of the first matrix."""
     found: dict[str, np.ndarray] = {}
     for key, value in values.items():
         match = re.fullmatch(rf"(left|right|l|r)?({name})(left|right|l|r|[012])?", short(key))
@@ -163,7 +163,7 @@ def in_mm(length: float, unit: float | None = None) -> float | None:
 
 
 def baseline_in(values: Values, pair: bool) -> float | None:
-    """Return the baseline in mm that an object states, or None. Pairs may have a vector T."""
+    """Return the baseline in mm that an object states, or None. A pair may state it as vector T."""
     for key, value in values.items():
         if match := BASELINES.fullmatch(short(key)):
             units = zip(match.groups(), (1.0, MM_PER_CM, MM_PER_M), strict=True)
@@ -364,7 +364,7 @@ def colmap(values: Values, image: Pair) -> Any:
 def dso(values: Values, image: Pair) -> Values:
     """Read camera.txt of DSO and LSD-SLAM; numbers under 1 are fractions of width and height.
 
-    Without a model's name, a single further number is that of a fisheye, unless it is 0.
+    If the file does not name a model, a single fifth number other than 0 means a fisheye.
     """
     model, numbers, sides = values["DSO"]
     size, camera, more = numbers_in(sides), numbers_in(numbers)[:4], numbers_in(numbers)[4:]
@@ -383,7 +383,7 @@ def kitti(values: Values, image: Pair) -> Values | None:
         and (matrix := matrix_of(value, 12)) is not None
     }
     if not {0, 3} & {*found} and "P_rect_02" not in values:
-        return None  # OpenCV's files have P1 and P2
+        return None  # a file with only P1 and P2 is OpenCV's
     wanted = values.get("KITTI's views")
     only = next(iter(found))
     pairs = (each for each in (wanted, (2, 3), (0, 1)) if each and {*each} <= {*found})

@@ -23,16 +23,16 @@ from .transforms import transform_points, translation_matrix
 Both = tuple[np.ndarray, np.ndarray]
 
 MAX_STRETCH = 2.0
-"""A planar frame may enlarge or reduce any part of a view by at most this factor, relative to the
-median match and measured parallel to the line that is mapped to infinity. A view that needs a
-larger factor gets a polar frame. Chosen on Oxford, Middlebury, Strecha's fountain and KITTI."""
+"""A planar frame may enlarge or reduce a part of a view by at most this factor, relative to the
+scale at the median match. Scales are measured parallel to the line mapped to infinity. Other views
+get a polar frame. Chosen on pairs of Oxford, Middlebury, Strecha's fountain and KITTI."""
 
 MAX_AREA = 3.0
-"""Maximum area of a planar frame, relative to the larger view. Chosen like `MAX_STRETCH`."""
+"""Maximum area of a planar frame, as a multiple of the larger view's. Chosen like `MAX_STRETCH`."""
 
 RESOLVED_QUANTILE = 0.6
-"""A polar frame has the resolution of the first view at this quantile of the distances of the
-view's pixels from the epipole. Chosen like `MAX_STRETCH`."""
+"""A polar frame has the first view's resolution at one distance from the epipole, and a finer one
+nearer to it: this quantile of the distances of the view's pixels. Chosen like `MAX_STRETCH`."""
 
 MIN_RADIUS_PX = 8.0
 """A polar frame leaves out pixels nearer to the epipole than this, because hardly anything moves

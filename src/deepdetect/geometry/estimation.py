@@ -31,11 +31,12 @@ MAX_LOG10_NFA = -6.0
 """A geometry is trusted if log10 of its number of false alarms is below this. Chosen by hand."""
 
 NEARBY_AREA = 16.0
-"""Matches are near a model within this many times the area in which matches agree with it."""
+"""A match is near a model if it lies in the inlier region enlarged to this multiple of its area."""
 
 MAX_ORDERS = 100
-"""Matches are tried in at most this number of orders. OpenCV 5.0 raised an error for 20 of 1,600
-sets of 15 to 25 matches in a small region, and for the worst of these sets in 89 of 100 orders."""
+"""A fit tries at most this number of random orders of the matches, until OpenCV raises no error.
+OpenCV 5.0 raised one for 20 of 1,600 sets of 15 to 25 matches in a small region, and for the worst
+of these sets in 89 of 100 orders."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Number of matches that the minimal solver of each model needs."""
@@ -323,7 +324,7 @@ def log10_nfa(
     width, height = image_size
     if model == "homography":
         chance = pi * inlier_threshold**2 / (width * height)
-    else:  # relative area of a band along an epipolar line
+    else:  # area of a band along an epipolar line, relative to that of the image
         chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
     agreeing = int(np.count_nonzero(inliers))
     sample_size = MINIMAL_SAMPLE_SIZE[model]
@@ -335,8 +336,7 @@ def log10_nfa_nearby(errors: np.ndarray, model: str, inlier_threshold: float) ->
 
     Matches that are wrong by a few pixels, as on vague shapes in images of two sensors, lie near
     the true geometry. So more of them agree with some distorted geometry than if they ended
-    anywhere. The model must therefore have more inliers than if the matches in `NEARBY_AREA` times
-    the area of agreement were spread evenly over it.
+    anywhere. Random matches here are spread evenly over `NEARBY_AREA` times the inlier region.
     """
     reach = NEARBY_AREA**0.5 if model == "homography" else NEARBY_AREA
     count, agreeing = (
@@ -381,7 +381,7 @@ class Parallax:
         return self.log10_nfa < MAX_LOG10_NFA
 
     def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether it is `significant`, and `agreeing` is at least this fraction of `on_plane`."""
+        """Whether the parallax is `significant`, and `agreeing` >= this fraction of `on_plane`."""
         return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property
@@ -397,8 +397,8 @@ class TwoViewModel(Geometry):
 
     Attributes:
         log10_nfa: decimal logarithm of the number of false alarms of the geometry.
-        parallax: parallax of the matches that the homography does not explain, or None if it was
-            not measured.
+        parallax: parallax of the matches relative to the plane of the homography, or None if it
+            was not measured.
     """
 
     log10_nfa: float

@@ -12,11 +12,11 @@ from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
 ANTIALIASING_SIGMA = 0.5
-"""Sigma of the blur before downscaling, in sqrt(1 / scale^2 - 1) pixels. Chosen by hand."""
+"""Sigma of the blur before downscaling, in units of sqrt(1 / scale^2 - 1) px. Chosen by hand."""
 
 WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25
-"""Images are blurred by this sigma against noise before they are compared. Chosen by hand."""
+"""`warped_zncc` compares windows of WINDOW_PX after a blur against noise. Chosen by hand."""
 
 MAX_UNKNOWN_WEIGHT = 1e-3
 """Maximum total weight of pixels without data in an interpolated pixel. Chosen by hand."""
@@ -61,7 +61,7 @@ def warp_to_reference(
 def warp_visible(
     pixels: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Warp an image, with transparent pixels or not, to RGB and a mask (`warp_to_reference`)."""
+    """Warp RGB or RGBA pixels by `warp_to_reference`; return RGB and a mask of visible pixels."""
     warped, valid = warp_to_reference(continued(pixels), homography, size)
     return without_touched(warped, valid)
 

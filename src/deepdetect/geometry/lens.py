@@ -19,12 +19,12 @@ of 150 degrees 0.65. Fits cannot tell denser values apart."""
 MIN_DISTORTION, MIN_DEVIATIONS = 0.2, 6.0
 """Distortion below MIN_DISTORTION does no harm: matches miss epipolar lines by few pixels. A
 distorted model fits better if the mean cost of matches falls by MIN_DEVIATIONS standard deviations
-(Vuong's test). 201 pinhole pairs have at most 4.3 (a street) and 1.9, fisheyes up to 25."""
+(Vuong's test). The highest of 201 pinhole pairs are 4.3 (a street) and 1.9; fisheyes reach 25."""
 
 MIN_FLAT_DEVIATIONS, NEAR = 12.0, 3.0
 """A distorted homography (of a plane, or a turned camera) must fit better by MIN_FLAT_DEVIATIONS,
-also after multiplication by a ratio: its number of matches within NEAR times `SCALE`, over that of
-a pinhole's epipolar lines. A curved cloth has 16 * 0.56, the lenses found 15 (GoPro) to 44."""
+also if its deviations are multiplied by a ratio: its matches within NEAR times `SCALE` to those of
+a fundamental matrix. A curved cloth reaches 16 * 0.56, the lenses found 15 (a GoPro) to 44."""
 
 MIN_MATCHES = 30
 """Distortion is not estimated from fewer matches, because it may fit them by chance."""
@@ -70,7 +70,7 @@ def distortion(
 def _compared(
     xy: list[np.ndarray], agreeing: np.ndarray, flat: bool, least: float
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return a distortion that fits better by `least` deviations, or 0; costs without and with it.
+    """Return a distortion that fits `least` deviations better, or 0; costs without and with it.
 
     `xy` are positions relative to the middle of the image, in half diagonals.
     """

@@ -19,7 +19,7 @@ from .similarity import MAD_STD
 from .transforms import epipolar_errors, signed_epipolar_errors
 
 MIN_MATCHES = 6
-"""Five matches determine a pose; a sixth one also says something of the cameras."""
+"""Five matches determine a pose; only from a sixth on do they constrain the cameras."""
 
 START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
 """Focal lengths in units of the image's longer side. The refinement starts from the one that makes
@@ -43,8 +43,8 @@ def refine_fundamental(
 ) -> np.ndarray:
     """Refine a fundamental matrix by mostly correct matches and a prior on the two cameras.
 
-    Each source has (M, 2) positions in both images; its median error sets the weight of its
-    matches. The result has norm 1. With fewer than six matches, the matrix is returned as it is.
+    `sources` are sets of matches: (M, 2) positions in both images, weighted by their median error.
+    The result has norm 1. With fewer than six matches, `fundamental` is returned as it is.
     """
     points0, points1 = (np.concatenate([each[side] for each in sources]) for side in (0, 1))
     if len(points0) < MIN_MATCHES:

@@ -124,7 +124,7 @@ class RelativePose:
         inliers: (M,) bool, True for matches with an error below the threshold.
         errors: (M,) float64 Sampson distances of all matches in pixels.
         cheirality_ratio: fraction of the inliers that lie in front of both cameras, in [0, 1].
-        left_out: fraction of the image that `estimate_pose` left out, because it stays in place.
+        left_out: fraction of the image that `estimate_pose` ignored, as it stands still (overlays).
     """
 
     rotation: np.ndarray

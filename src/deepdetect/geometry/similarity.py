@@ -26,12 +26,12 @@ MAX_START_TILT_DEG = 60.0
 this angle, because three points that lie nearly on a line can give any tilt."""
 
 MIN_AREA_POINTS, MIN_AREA, MUCH_BETTER = 8, 0.2, 0.5
-"""The known upward direction is ignored only for MIN_AREA_POINTS or more points whose second
-principal axis is above MIN_AREA times as long as the first, and if the median residual is then
-below MUCH_BETTER times the one with the upward direction. Chosen by hand."""
+"""A known upward direction is ignored only if there are at least MIN_AREA_POINTS points, their
+second principal axis is longer than MIN_AREA times the first, and the median residual without the
+direction is below MUCH_BETTER times that with it. Chosen by hand."""
 
 HUBER_STDS, WRONG_STDS = 2.0, 5.0
-"""Residuals get less weight above HUBER_STDS sigmas, none above WRONG_STDS. Chosen by hand."""
+"""Residuals above HUBER_STDS sigmas get less weight, above WRONG_STDS none. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
 """The stated accuracy of the targets counts as much as this number of residuals, because a few
@@ -66,7 +66,7 @@ class SimilarityFit:
         wrong: (N,) bool, True for points that do not agree with the others.
         scale_std: relative standard deviation of the scale; 0 if the scale was given.
         axes_std_deg: (3,) standard deviations of the rotation about the targets' axes, in degrees.
-        axis_std_deg_of_targets: the same about the least certain axis without `level`; at most 180.
+        axis_std_deg_of_targets: that about the least certain axis without `level`; at most 180.
     """
 
     similarity: Similarity
@@ -92,7 +92,7 @@ def fit_similarity(
     Args:
         points: (N, 3) positions of at least three points.
         targets: (N, 3) positions of the same points, z up; z may be NaN where it is unknown.
-        accuracy: expected standard deviation of the targets.
+        accuracy: expected standard deviation of the targets, in their unit of length.
         up: (3,) approximate upward direction in the frame of the points.
         level, level_stds: (L, 3) horizontal directions in the frame of the points, and their (L,)
             standard deviations in radians.

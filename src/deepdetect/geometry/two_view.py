@@ -14,8 +14,8 @@ from .estimation import (
 from .refinement import START_FOCAL_LENGTHS
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
-"""Inlier thresholds in pixels of the models that guide matching. These models are fitted to less
-accurate keypoints, from reduced copies of the images."""
+"""Inlier thresholds in pixels of the models that guide matching. The keypoints of these models come
+from reduced images, and are less accurate than those from full size."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
 """Inlier thresholds in pixels of the models by which a rectified pair or a pure rotation is
@@ -66,7 +66,7 @@ def is_pure_rotation(points0: np.ndarray, points1: np.ndarray, calibration: Cali
 
 
 def is_usual_rotation(points0: np.ndarray, points1: np.ndarray, sizes: tuple[Size, Size]) -> bool:
-    """Return whether a rotation explains (M, 2) matches at one of `START_FOCAL_LENGTHS`."""
+    """Return whether a rotation fits (M, 2) matches at one of `START_FOCAL_LENGTHS`."""
     for focal in START_FOCAL_LENGTHS:
         cameras = [Camera(size, focal * max(size)) for size in sizes]
         if is_pure_rotation(points0, points1, Calibration(cameras[0], cameras[1])):
