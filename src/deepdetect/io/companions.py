@@ -60,6 +60,6 @@ def _has_two_levels(path: Path) -> bool:
 def tell_left_out(paths: Sequence[Path], what: str) -> None:
     """Warn that the files `paths` are left out; `what` says what they are, in the plural."""
     if paths:
-        first = Path(*paths[0].parts[-2:])  # the same sentence for an absolute path
+        first = Path(*paths[0].parts[-2:])  # absolute paths give the same text
         text = f"{len(paths)} {what} are left out, such as {first} (rename them to use them)"
         warnings.warn(text, UserWarning, stacklevel=4)

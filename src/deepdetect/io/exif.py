@@ -70,7 +70,7 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
 
 
 def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None:
-    """Return (fx, fy) in pixels computed from the sensor resolution, or None."""
+    """Return (fx, fy) in pixels from the sensor resolution, times `scale`, or None without tags."""
     length = _number(tags.get(Base.FocalLength))
     unit = MM_PER_UNIT.get(int(_number(tags.get(Base.FocalPlaneResolutionUnit))) or 2, 0.0)
     across = _number(tags.get(Base.FocalPlaneXResolution))
@@ -81,7 +81,7 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 
 def read_tags(image: Any) -> tuple[dict[int, Any], dict[str, Any]]:
-    """Return the EXIF tags of a file or PIL image, and Pillow's `info` of it with its size."""
+    """Return the EXIF tags of a file or PIL image, and its `info` of Pillow with the key "size"."""
     try:
         with open_image(image) if is_file(image) else nullcontext(image) as opened:
             exif = opened.getexif()

@@ -105,7 +105,7 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 
 def _degrees(value: Any, below: bool) -> float:
-    """Convert degrees, minutes, seconds to degrees: negative if `below`, NaN if invalid."""
+    """Convert degrees, minutes, seconds to degrees: negative if `below` 0, NaN if invalid."""
     degrees, minutes, seconds = [*map(_number, np.ravel(value)), 0.0, 0.0][:3]
     sum_ = degrees + minutes / 60 + (seconds if np.isfinite(seconds) else 0) / 3600
     return -sum_ if below else sum_

@@ -59,7 +59,7 @@ GREY_PNG = 0
 """Colour type of a grey PNG image: the value at offset 25 of the file."""
 
 STRIP_PIXELS = 1 << 20
-"""PIL images are converted in strips of this size, since copies of a large image take gigabytes."""
+"""PIL images are converted in strips of this size: a copy of a large image takes gigabytes."""
 
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda image: cv2.flip(image, 1),
@@ -177,7 +177,7 @@ def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOption
 
     Every function that reads several images does so in such a block. The range is found from all
     `images` that may have 16 bits, or from `SEEN_IMAGES` at equal steps, unless the first of them
-    does not need it. Open files and pipes are skipped: they may be readable only once.
+    states its own. Open files and pipes are skipped, because they may be readable only once.
     """
     options, counts = reading_options(), np.zeros(1 << 16, np.int64)
     seen = [each for each in images if _may_be_deep(each)] if options.deep_range is None else []

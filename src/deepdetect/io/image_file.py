@@ -49,7 +49,7 @@ FORMATS = {
     "SGI": ".sgi",
     "PCX": ".pcx",
     "HEIF": ".heic .heif .hif",  # if a plug-in of Pillow registers it
-    "JXL": ".jxl",  # likewise
+    "JXL": ".jxl",  # if a plug-in registers it
     "TGA": ".tga",  # has no signature, so it comes last
 }
 """Formats that are read, with their suffixes. EPS is not read, since it would start Ghostscript."""
@@ -147,7 +147,7 @@ class ReadingOptions:
 
     @property
     def common(self) -> dict[str, Any]:
-        """What `array_to_pixels` needs to know about the other images of the call."""
+        """Arguments of `array_to_pixels` for the value range that all images of a call share."""
         return {"call": self.deep_range, "counts": self.counts}
 
     @property

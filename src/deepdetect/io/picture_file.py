@@ -81,8 +81,8 @@ class Metadata:
         profile: the ICC profile, or None.
         exif: the EXIF as an object of Pillow, or None.
         bands: number of bands, alpha included.
-        dtype: data type of a value.
-        mask: (H, W) bool, false where a GeoTIFF that is written has no data, or None.
+        dtype: NumPy data type of the values.
+        mask: (H, W) bool, false where a GeoTIFF to be written has no data; None: it has all.
     """
 
     to_world: np.ndarray | None = None
@@ -163,13 +163,13 @@ class Metadata:
         return profile[:length] if length <= len(profile) and profile[16:20] == space else None
 
     def _exif_of(self, picture: np.ndarray) -> Any:
-        """Return the EXIF, adapted to the size of an upright picture, or None if there is none."""
+        """Return the EXIF with the size of `picture` and upright orientation, or None if missing."""
         if not self.exif:
             return None
         height, width = picture.shape[:2]
         fine = self.exif.get_ifd(IFD.Exif)
         size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
-        if size != (width, height):  # the tag applies only to the whole frame
+        if size != (width, height):  # the tag deleted here assumes the whole frame
             fine.pop(Base.FocalLengthIn35mmFilm, None)
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1

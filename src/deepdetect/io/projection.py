@@ -1,4 +1,4 @@
-"""Whether an image is a panorama or a fisheye picture, which no pinhole geometry fits."""
+"""Recognise panoramas and fisheye pictures, which no pinhole geometry fits."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ MIN_ASPECT, MAX_ASPECT = 1.95, 2.05
 equirectangular (2:1, with a margin for resizing); a wider one may be cylindrical."""
 
 ROWS, DETAIL, FAR, MARGIN = 256, 31, 16, 1.3
-"""Left and right edges meet if, over ROWS rows less the mean of DETAIL of them, they differ MARGIN
-times less than either does from columns 1 / FAR of the width away, and than mirrored columns do.
-Chosen on 50 rendered rooms; of 60 others it misses 1.1 % (JPEG quality 30: none), and it refuses 1
-of 3,222 other photographs cut to 2:1 and wider (a banner, mirrored)."""
+"""Left and right edge of a panorama meet: they differ MARGIN times less than either edge does from
+columns 1 / FAR of the width away, and than mirrored columns do. Images have ROWS rows, less means
+over DETAIL rows. Chosen on 50 panoramas of rendered rooms; of 60 others, 1.1 % are missed (JPEG
+quality 30: none). One of 3,222 photographs cut to 2:1 or wider is refused (a mirrored banner)."""
 
 SIDE_PX, BLACK, PLAIN, RIM, MAX_DARK, ROUNDNESS, MAX_CUT = 128, 16, 8, 2, 48, (0.97, 0.92), 16 / 9
-"""Fisheye circles are sought in images reduced to a shorter side of SIDE_PX, over BLACK grey levels
-(ITU-R BT.601) off the corners: dark ones up to MAX_DARK (noise), or ones that vary by up to PLAIN,
-as does all over RIM px outside (no shadow). They fill ROUNDNESS[0] of a disc (an octagon: 0.90), or
-ROUNDNESS[1] if two are side by side, and are 1 to MAX_CUT shorter sides wide. Chosen by hand."""
+"""A fisheye circle differs from the image corners by over BLACK grey levels, after the shorter side
+was reduced to SIDE_PX. Corners are dark, up to MAX_DARK (noise), or they and all pixels over RIM px
+outside the circle vary by up to PLAIN. The circle fills ROUNDNESS[0] of a disc (an octagon: 0.90),
+of two side by side ROUNDNESS[1], and is 1 to MAX_CUT shorter sides wide. Chosen by hand."""
 
 VIEWS = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90 view.png"
 
@@ -78,8 +78,8 @@ def edges_meet(gray: np.ndarray) -> bool:
     few, size = gray[:: max(1, height // (2 * ROWS))], (min(2 * ROWS, width), min(ROWS, height))
     values = cv2.resize(few, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     values -= cv2.blur(values, (1, DETAIL))
-    values = np.sign(values) * np.sqrt(np.abs(values))  # so that no single outline decides
-    values /= np.sqrt((values**2).sum(axis=0) + len(values) / 12)  # 1/12: rounding
+    values = np.sign(values) * np.sqrt(np.abs(values))  # so that no single edge decides
+    values /= np.sqrt((values**2).sum(axis=0) + len(values) / 12)  # 1/12: variance of rounding
     far = size[0] // FAR
     mirrored = (values * values[:, ::-1]).sum(axis=0)[far // 2 : (size[0] - far) // 2]
     alike = max((values[:, [0, -1]].T @ values[:, far:-far]).max(), mirrored.max())

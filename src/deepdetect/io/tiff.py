@@ -45,7 +45,7 @@ def read_tiff(
     """Read an image of a TIFF file.
 
     Returns:
-        (H, W, 3) RGB, or (H, W, 4) as in `alpha`, not yet turned upright, and the EXIF orientation.
+        (H, W, 3) RGB or (H, W, 4) with alpha, not yet turned upright, and the EXIF orientation.
         RGB is uint8, or uint16 if `deep` and the file has more than 8 bits per value. If `raw`, all
         bands of a grey or RGB file are returned instead, (H, W, C), in their own data type.
 
@@ -125,7 +125,7 @@ def page_numbers(source: Any, frames: bool = False) -> list[int]:
     """Return the numbers, from 0, of the images in a file: values of `page` in `load_image`.
 
     Images at most half as wide or high as the largest do not count: previews, gain maps, and the
-    levels of a pyramid. As `frames` of a video, channels, and frames of several slices, are errors.
+    levels of a pyramid. If they are `frames` of a video, channels or slices of each are errors.
     """
     from tifffile import TiffFile
 
@@ -143,7 +143,7 @@ def page_numbers(source: Any, frames: bool = False) -> list[int]:
                 sizes = [(each.imagewidth, each.imagelength) for each in whole_pages([*tiff.pages])]
         else:
             with identify(file, name) as image:
-                count = 1 if image.format == "PSD" else getattr(image, "n_frames", 1)  # layers
+                count = 1 if image.format == "PSD" else getattr(image, "n_frames", 1)  # PSD: layers
                 sizes = [image.seek(k) or image.size for k in range(count)]
     width, height = np.max(sizes, axis=0)
     return [k for k, (w, h) in enumerate(sizes) if 2 * w > width and 2 * h > height]
@@ -176,7 +176,7 @@ def _to_pixels(
     chosen = _chosen_bands(bands, page, name, options)
     value = no_data_of(page)
     each = np.isnan(chosen) | (chosen == (np.nan if value is None else value))
-    absent = each.all(axis=2)  # as GDAL sees it: 0 in one of three bands is a colour
+    absent = each.all(axis=2)  # like GDAL: 0 in one of three bands is a colour
     empty = each if chosen.dtype.kind == "f" else absent[..., None]
     if empty.any():
         chosen = np.where(empty, chosen.dtype.type(0), chosen)
