@@ -48,7 +48,7 @@ the distance. The smallest distance is 1 px, because dense keypoints are 1 px ap
 
 SEARCH_SHRINK = 3
 """PatchMatch also tries random positions around the best match. The search radius starts at half
-the longer side of the image, and is divided by this number again and again."""
+the longer side of the second image, and is divided by this number after each try."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
 """Nearest neighbours of N queries: their rows in the base, (N, count) int32, and their distances,

@@ -16,7 +16,7 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, GeometryOptions, log1
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""The end of a match belongs to the nearest keypoint within this distance. Chosen by hand."""
+"""A position in a match is that of the nearest keypoint up to this far away. Chosen by hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,
@@ -38,9 +38,9 @@ class Evidence:
             expected number of geometries with as many inliers among random matches.
         simulated_views: number of views that were simulated to find the geometry, as in ASIFT.
         on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
-        verified: fraction of the images' overlap that the geometry explains: places where the
-            images are more similar than nearly all places of displaced copies.
-        agreement: fraction of the places with structure where the images do not contradict it.
+        verified: fraction of the overlap where the images, aligned by the geometry, are more
+            similar than images displaced against each other are at nearly all places.
+        agreement: fraction of the places with structure where images do not contradict the model.
         correlation: median correlation of the descriptors at places with structure. In a scene with
             depth, only the surrounding matches, not those at the place itself, predict where the
             second image shows it. 0 if there are few matches.
@@ -67,9 +67,9 @@ class Layer:
 
     Attributes:
         model: "homography" or "fundamental".
-        matrix: (3, 3) float64, as of `TwoViewGeometry`.
-        share: fraction of the images' overlap that this geometry explains; 0 if only sparse matches
-            support the geometry.
+        matrix: (3, 3) float64, as in `TwoViewGeometry`.
+        share: fraction of the images' overlap that fits this geometry, as `Evidence.verified`; 0 if
+            only sparse matches support the geometry.
     """
 
     model: str
@@ -98,8 +98,8 @@ class TwoViewGeometry:
         confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" if the model
             is "none".
         evidence: the measurements on which the decision rests.
-        layers: the geometries that guided matching found. The first explains most of the images,
-            the others explain moving objects. `Matches.layer` tells which geometry a match follows.
+        layers: the geometries that guided matching found. The first is that of the scene, which
+            covers most of the images; the others are of moving objects. See `Matches.layer`.
     """
 
     model: str
@@ -125,7 +125,7 @@ def _swapped(model: str, matrix: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class GuidedMatches:
-    """Matches of keypoints of the first image.
+    """Matches from keypoints of the first image to positions in the second, by guided matching.
 
     Attributes:
         indices0: (M,) int64 rows of the keypoints of the first image, ascending, each once.
@@ -138,7 +138,7 @@ class GuidedMatches:
         alike: (M,) bool, False if the images contradict a match. Surrounding matches predict where
             the second image shows the window around a match in the first image; in contradicted
             matches, the window is no more similar to that place than to unrelated windows.
-        layer: (M,) int8 number of the geometry that a match follows.
+        layer: (M,) int8 index of the geometry that a match follows (`TwoViewGeometry.layers`).
     """
 
     indices0: np.ndarray

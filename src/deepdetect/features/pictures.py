@@ -24,7 +24,7 @@ SHOWN_KEYPOINTS, AREA_OF_KEYPOINT_PX = 1000, 200
 pixels, so that viewers can tell them apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
-"""Colours start at this level of the scale from 0 to 1, because darker colours are hard to see."""
+"""Colours start at this level of viridis, from 0 to 1, because darker ones are hard to see."""
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:

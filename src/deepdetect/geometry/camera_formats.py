@@ -82,8 +82,8 @@ class Format(NamedTuple):
     """A file format: its name, a pattern that one of its keys matches, and its reader, if needed.
 
     `first` is the x and y of the first pixel's centre; None means 0, or 1 for MATLAB's transposed
-    matrix. If it is "middle", principal points are relative to the image centre. If "fractions",
-    they also are, and they and focal lengths are in fractions of the longer side.
+    matrix. If it is "middle" or "fractions", principal points are relative to the image centre. If
+    it is "fractions", these and the focal lengths are in fractions of the longer side.
     """
 
     name: str
@@ -200,7 +200,7 @@ def check_pinhole(values: Values) -> None:
 
 
 def check_whole(values: Values) -> None:
-    """Raise an error if a value says that the camera's images are cropped or smaller."""
+    """Raise an error if a value says that the camera's images are cropped or binned."""
     for key, value in values.items():
         least = str(key).startswith("binning")
         if CROPS.fullmatch(str(key)) and any(number > least for number in numbers_in(value)):
@@ -211,7 +211,7 @@ def check_whole(values: Values) -> None:
 
 
 def _pair_at(values: Values, choices: Iterable[tuple[str, ...]]) -> list[float]:
-    """Return both values of the first choice of keys in `values`, or []; repeat a single value."""
+    """Return the values of the first pair of keys that `values` has, a single one twice, or []."""
     for names in choices:
         if numbers := [n for name in names for n in numbers_in(values.get(name))]:
             if len(numbers) < len(names):

@@ -363,8 +363,8 @@ def _log10_nfa(
 class Parallax:
     """How many matches lie off a plane, and how many of them agree on an epipole.
 
-    If a homography does not explain a correct match of a static scene, the match is displaced from
-    the predicted position along a line through the epipole (Chum, Werner and Matas, "Two-view
+    A correct match of a static scene that lies off the plane of a homography is displaced from the
+    predicted position along a line through the epipole (Chum, Werner and Matas, "Two-view
     geometry estimation unaffected by a dominant plane", 2005). Wrong matches are displaced in any
     direction, except for a few in one direction on a repeated pattern. `log10_nfa` is the log10 of
     the number of false alarms of the agreement on the epipole.

@@ -16,7 +16,7 @@ ANTIALIASING_SIGMA = 0.5
 
 WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25
-"""`warped_zncc` compares windows of WINDOW_PX after a blur against noise. Chosen by hand."""
+"""`warped_zncc` compares windows of WINDOW_PX after a blur by BLUR_SIGMA_PX. Chosen by hand."""
 
 MAX_UNKNOWN_WEIGHT = 1e-3
 """Maximum total weight of pixels without data in an interpolated pixel. Chosen by hand."""

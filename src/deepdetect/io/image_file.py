@@ -408,7 +408,7 @@ def develop(file: BinaryIO, name: str) -> Any:
 
 
 def _hide_warning_of_large_images() -> None:
-    """Hide Pillow's warning about 89 to 178 megapixels, unless the program filters it itself."""
+    """Hide Pillow's warning about images of 89 to 178 megapixels, unless the program filters it."""
     from PIL import Image
 
     kind = Image.DecompressionBombWarning

@@ -163,7 +163,7 @@ class Metadata:
         return profile[:length] if length <= len(profile) and profile[16:20] == space else None
 
     def _exif_of(self, picture: np.ndarray) -> Any:
-        """Return the EXIF with the size of `picture` and upright orientation, or None if missing."""
+        """Return the EXIF, changed to the size of `picture` and upright orientation, or None."""
         if not self.exif:
             return None
         height, width = picture.shape[:2]

@@ -125,7 +125,7 @@ def page_numbers(source: Any, frames: bool = False) -> list[int]:
     """Return the numbers, from 0, of the images in a file: values of `page` in `load_image`.
 
     Images at most half as wide or high as the largest do not count: previews, gain maps, and the
-    levels of a pyramid. If they are `frames` of a video, channels or slices of each are errors.
+    levels of a pyramid. With `frames` (of a video), channels, or slices of frames, are errors.
     """
     from tifffile import TiffFile
 

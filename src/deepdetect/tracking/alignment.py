@@ -40,8 +40,8 @@ MAX_GROWTH = 4.0
 the patch on too few pixels. Chosen by hand."""
 
 RIDGE = 1e-4
-"""This fraction of the scale of the normal equations is added to their diagonal, because they are
-singular for a patch that shows only parallel edges. Chosen by hand."""
+"""This multiple of the mean squared gradient is added to the diagonal of the normal equations,
+because they are singular for a patch that shows only parallel edges. Chosen by hand."""
 
 MOST_READ = 1 << 14
 """OpenCV limits the sides of images to 32,767 px, so at most this many patches are read at once."""

@@ -69,7 +69,7 @@ class TrackingReport:
 
 
 def point_candidates(options: TrackingOptions = TrackingOptions()) -> Detect:
-    """Return a function that detects the best points of a frame, for a `Tracker`."""
+    """Return a detector for a `Tracker`: `CANDIDATES` points of a frame for each possible track."""
     return PointDetector(CANDIDATES * options.max_keypoints).detect
 
 

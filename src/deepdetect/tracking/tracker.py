@@ -219,7 +219,7 @@ class Tracker:
 def free_keypoints(
     keypoints: Keypoints, taken: np.ndarray, distance_px: float, count: int
 ) -> np.ndarray:
-    """Choose up to `count` keypoints, best first, that are far from tracks and from each other.
+    """Choose up to `count` keypoints, best first, over `distance_px` from tracks and each other.
 
     `taken` are the (M, 2) positions of the tracks. Returns the (K,) indices of the keypoints.
     Distances are measured between positions that are rounded to whole pixels.

@@ -35,7 +35,7 @@ MAX_FPS = 1000.0
 """If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
 EQUAL_FRAMES = 4
-"""If so many frames repeat the one before, another reader tells whether they really are equal."""
+"""Once this many frames equal the one before, `_SecondReader` checks that they do in the file."""
 
 SINGLE = "has a single frame: give a video, or a folder of frames"
 
@@ -181,10 +181,10 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
 
 class _SecondReader:
-    """Another reader of a video, which tells whether equal frames really are equal.
+    """Another reader of a video, which tells whether equal frames are equal in the file.
 
     The conversion of interlaced frames fails in OpenCV 4.14 and 5.0, which then return the previous
-    contents of the memory. That of the second reader is new, or holds another frame.
+    contents of the memory. The second reader's memory is new, or holds another frame.
     """
 
     def __init__(self, path: Path) -> None:
@@ -195,9 +195,9 @@ class _SecondReader:
         return cv2.VideoCapture(str(self._path))
 
     def check(self, number: int, equal: int, bgr: np.ndarray, *, black: bool = True) -> None:
-        """Raise an error if a frame, one of `equal` ones that repeat another, should not do so.
+        """Raise an error if the second reader gives other pixels than `bgr` for frame `number`.
 
-        Unless it may be `black`, as new memory is.
+        `equal` is the number of repeats. Unless `black`, black frames, like new memory, also fail.
         """
         for _ in range(self._grabbed, number + 1):
             self._video.grab()
@@ -221,7 +221,7 @@ def _camera_number(source: str | Path | int) -> int | None:
 
 
 def _undecoded(path: Path) -> Any:
-    """Open a video to read its packets, which FFmpeg reads in a fiftieth of the time of frames."""
+    """Open a video to count its packets, which takes a fiftieth of the time of decoding frames."""
     if cv2.CAP_FFMPEG not in cv2.videoio_registry.getBackends():
         return cv2.VideoCapture(str(path))
     return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
