@@ -351,7 +351,7 @@ class Matches:
         best_first = np.argsort(-self.scores, kind="stable")
         for side in (0, 1):
             ends = getattr(self, f"indices{side}").astype(np.int64)
-            without = np.flatnonzero(ends < 0)  # their pixels get negative numbers
+            without = np.flatnonzero(ends < 0)  # numbered by pixel, below 0
             pixels = np.floor(getattr(self, f"points{side}")[without] + np.float32(0.5))
             pixels = np.unique(pixels.astype(np.int64), axis=0, return_inverse=True)[1]
             ends[without] = -1 - pixels.reshape(-1)

@@ -31,8 +31,8 @@ MAX_AREA = 3.0
 """Maximum area of a planar frame, as a multiple of the larger view's. Chosen like `MAX_STRETCH`."""
 
 RESOLVED_QUANTILE = 0.6
-"""A polar frame has the first view's resolution at one distance from the epipole, and a finer one
-nearer to it: this quantile of the distances of the view's pixels. Chosen like `MAX_STRETCH`."""
+"""The resolution of a polar frame falls with the distance from the epipole. It equals the first
+view's at this quantile of the distances of the view's pixels. Chosen like `MAX_STRETCH`."""
 
 MIN_RADIUS_PX = 8.0
 """A polar frame leaves out pixels nearer to the epipole than this, because hardly anything moves

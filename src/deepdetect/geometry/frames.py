@@ -96,7 +96,7 @@ def _convex_hull(region: np.ndarray) -> tuple[np.ndarray, bool]:
 
 
 def widened(mask: np.ndarray, radius_px: int) -> np.ndarray:
-    """Return a (H, W) bool mask with all pixels up to `radius_px` away in x and in y."""
+    """Dilate a (H, W) bool mask by `radius_px` in x and in y."""
     side = 2 * radius_px + 1
     return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 

@@ -224,7 +224,7 @@ def least_squares_similarity(
 def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.ndarray:
     """Return the (3,) standard deviations of the targets; those of x and y are the same."""
     stds = []
-    for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: number of parameters fitted to them
+    for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: parameters fitted to these axes
         values = np.abs(residuals[:, axes][known[:, axes]])
         squares = len(values) * (MAD_STD * np.median(values)) ** 2 if len(values) else 0.0
         free = PRIOR_COUNT + max(len(values) - lost, 0)

@@ -245,7 +245,7 @@ def open_file(source: Any, what: str = "image") -> Iterator[tuple[BinaryIO, str]
     except FileNotFoundError:
         raise MissingImageError(f"there is no file {name}: check the path") from None
     except OSError as error:
-        if error.errno is None:  # from Pillow, not from the file system
+        if error.errno is None:  # an error of Pillow, not of the file system
             raise damaged_image(name, error) from None
         raise ImageError(f"{name} cannot be read ({error.strerror}): check the path") from None
     except Exception as error:  # Pillow's decoders raise many types of errors

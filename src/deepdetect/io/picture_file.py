@@ -169,7 +169,7 @@ class Metadata:
         height, width = picture.shape[:2]
         fine = self.exif.get_ifd(IFD.Exif)
         size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
-        if size != (width, height):  # the tag deleted here assumes the whole frame
+        if size != (width, height):  # the tag holds only for the whole frame
             fine.pop(Base.FocalLengthIn35mmFilm, None)
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1
@@ -261,7 +261,7 @@ def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
     with open_file(source) as (file, _):
         if file.read(4) in TIFF_STARTS:
             (found, page), kind = _of_tiff(file), "TIFF"
-    with suppress(Exception), open_image(source) as image:  # fails for raw photographs
+    with suppress(Exception), open_image(source) as image:  # raw photographs fail
         found = replace(found, profile=found.profile or image.info.get("icc_profile"))
         exif, kind = image.getexif(), image.format
         kept = _kept_exif(exif) if kind == "TIFF" else exif

@@ -20,8 +20,8 @@ equirectangular (2:1, with a margin for resizing); a wider one may be cylindrica
 
 ROWS, DETAIL, FAR, MARGIN = 256, 31, 16, 1.3
 """Left and right edge of a panorama meet: they differ MARGIN times less than either edge does from
-columns 1 / FAR of the width away, and than mirrored columns do. Images have ROWS rows, less means
-over DETAIL rows. Chosen on 50 panoramas of rendered rooms; of 60 others, 1.1 % are missed (JPEG
+columns 1 / FAR of the width away, and than mirrored columns do. ROWS rows are compared, minus the
+mean of DETAIL rows. Chosen on 50 panoramas of rendered rooms; of 60 others, 1.1 % are missed (JPEG
 quality 30: none). One of 3,222 photographs cut to 2:1 or wider is refused (a mirrored banner)."""
 
 SIDE_PX, BLACK, PLAIN, RIM, MAX_DARK, ROUNDNESS, MAX_CUT = 128, 16, 8, 2, 48, (0.97, 0.92), 16 / 9
