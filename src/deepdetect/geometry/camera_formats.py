@@ -99,7 +99,7 @@ def short(key: Any) -> str:
 
 
 def numbers_in(value: Any) -> list[float]:
-    """Return the numbers of a text, or of a nested list or object; [] for booleans and other text."""
+    """Return the numbers of a text, nested list or object; [] for booleans and other text."""
     if isinstance(value, bytes) or (isinstance(value, str) and value.startswith("$base64$")):
         raise ReconstructionError("it has its numbers in base64: write it without base64")
     if isinstance(value, str):
