@@ -76,7 +76,7 @@ def match_learned(
     Descriptors that are rotated to the keypoints' own angles match under any rotation of the image.
     Matches of the best keypoints therefore tell the rotation between the images. Then only this
     common rotation is undone, and all keypoints are matched by upright descriptors. These are more
-    distinctive: on HPatches, they have 570 correct matches instead of 449.
+    distinctive: on HPatches, 570 matches are correct, against 449 with the keypoints' own angles.
     """
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
     assert descriptors0 is not None

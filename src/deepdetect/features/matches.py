@@ -16,7 +16,7 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, GeometryOptions, log1
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""A position in a match is that of the nearest keypoint up to this far away. Chosen by hand."""
+"""The keypoint at an end of a match is the nearest one within this distance. Chosen by hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,

@@ -176,8 +176,8 @@ def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOption
     """Read all uint16 images in the block with one value range; yield the reading options.
 
     Every function that reads several images does so in such a block. The range is found from all
-    `images` that may have 16 bits, or from `SEEN_IMAGES` at equal steps, unless the first of them
-    states its own. Open files and pipes are skipped, because they may be readable only once.
+    `images` that may have 16 bits, or from `SEEN_IMAGES` at equal steps; not if the first of them
+    has 8 bits or states its range. Open files and pipes, perhaps readable only once, are skipped.
     """
     options, counts = reading_options(), np.zeros(1 << 16, np.int64)
     seen = [each for each in images if _may_be_deep(each)] if options.deep_range is None else []
