@@ -237,3 +237,30 @@ def test_a_step_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) ->
     require_memory("a million keypoints", "take fewer", matched_keypoint=1e6)
     with pytest.raises(OptionError):
         require_memory("many keypoints", "take fewer", matched_keypoint=1.1e6)
+
+
+def blas_threads() -> set[int]:
+    return {
+        each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"
+    }
+
+
+def test_blas_uses_one_thread_until_the_last_of_several_calls_ends() -> None:
+    """The calls of two threads overlap; whichever ends last restores the number of threads."""
+    with threadpool_limits(2, user_api="blas"):
+        entered, leave = Event(), Event()
+
+        def call() -> None:
+            with one_blas_thread():
+                entered.set()
+                leave.wait(10)
+
+        other = Thread(target=call)
+        with one_blas_thread():
+            other.start()
+            entered.wait(10)
+            assert 1 in blas_threads()
+        assert 1 in blas_threads()
+        leave.set()
+        other.join()
+        assert blas_threads() <= {2}

@@ -16,7 +16,8 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -66,6 +67,9 @@ _max_threads: int | None = None
 
 _chosen = threading.local()
 """The attribute `threads` is the limit that `limited_threads` has set in the current thread."""
+
+_blas_lock, _blas_calls, _blas_limit = threading.Lock(), 0, ExitStack()
+"""The number of running calls of `one_blas_thread`, and the limit that the last one to end lifts."""
 
 TaskMap = Callable[..., Iterator[Any]]
 """Type of `map_in_processes`, and of functions that do the same on a cluster."""
@@ -208,9 +212,37 @@ def limited_threads(threads: int | None) -> Iterator[None]:
     before = getattr(_chosen, "threads", None)
     _chosen.threads = threads or before
     try:
-        yield
+        with one_blas_thread():
+            yield
     finally:
         _chosen.threads = before
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let NumPy's matrix products use one thread while the block runs.
+
+    The matrices are small. More threads spend most of their time waiting for each other.
+    """
+    global _blas_calls
+    with _blas_lock:
+        _blas_calls += 1
+        if _blas_calls == 1:
+            _blas_limit.enter_context(_blas().limit(limits=1, user_api="blas"))
+    try:
+        yield
+    finally:
+        with _blas_lock:
+            _blas_calls -= 1
+            if not _blas_calls:
+                _blas_limit.close()
+
+
+@cache
+def _blas() -> Any:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 def thread_limit() -> int | None:
