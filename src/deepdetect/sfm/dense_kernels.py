@@ -20,7 +20,7 @@ HIDDEN = np.uint64(1) << np.uint64(63)
 
 MIN_TEXTURE = np.float32(0.18)
 """A window has texture if the variance of its gradients along the epipolar line exceeds this
-multiple of the noise's variance. Plain skies with JPEG artefacts do not, weathered stone does."""
+multiple of the noise's variance. Skies with JPEG artefacts have less, weathered stone has more."""
 
 MIN_GAIN = np.float32(0.2)
 """A window's shift is divided by its contrast relative to the matching window of a neighbour.
@@ -29,7 +29,7 @@ Ratios below `MIN_GAIN` are raised to `MIN_GAIN`, so that the shift does not bec
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write to `line` (D, W) the two least Hamming distances to neighbours in row `y`, summed."""
+    """Write to `line` (D, W) the sums of row y's two least Hamming distances to neighbours."""
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
     for d in range(count):
