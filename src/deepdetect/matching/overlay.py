@@ -31,7 +31,7 @@ WINDOW_PX, MAX_DIFFERENCE, MIN_LIKENESS, MIN_GRADIENTS = 7, 0.3, 0.95, 32.0
 """A place looks the same in two images if, in a window of side WINDOW_PX, the difference of their
 gradients is below MAX_DIFFERENCE times the sum of both, or their correlation is above MIN_LIKENESS
 (letters before a brighter ground), and the sum is above MIN_GRADIENTS: 2 grey levels per pixel in
-each image, as Sobel's filter scales them. Neither finds an overlay in 313 pairs without one."""
+each image, as Sobel's filter scales them. In 313 pairs without an overlay, none was found."""
 
 MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
 """A match stands still if it moves by less than MAX_STILL_PX, about the error of a keypoint. The
@@ -51,8 +51,8 @@ window's shift is known if its structure tensor's determinant exceeds MIN_ROUNDN
 squared half trace, because an edge that moves along itself looks still."""
 
 CELL_PX = 32
-"""The motion of the scene is interpolated between squares of this side. Matches are counted by the
-number of squares that contain some."""
+"""The motion of the scene is interpolated between the centres of squares of this side. Still and
+moving matches are compared by the number of squares that contain some."""
 
 SOBEL_GAIN = 8
 """Sobel's 3 x 3 filter returns this multiple of the gradient."""
@@ -116,7 +116,7 @@ def still_matches(
         return places[some], ends[some], ~at_pixels(mask, places[some])
 
     _, found, least = _contradicted(still, small, outside)
-    if found.any():  # matches around what stands still show nothing, because it attracts them
+    if found.any():  # an overlay attracts the matches around it, so they are no evidence
         around = widened(still, FRAME_MARGIN_PX)
         _, found, least = _contradicted(still, small, lambda _: outside(around))
     overlay = found & (least > MIN_MOTION_PX)
@@ -190,8 +190,8 @@ def _contradicted(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find regions of still places that the motion of matches in two reduced images contradicts.
 
-    Returns (H, W) masks of regions that mostly do not move, and of those that stand exactly still;
-    and the least motion of the scene's matches near each pixel.
+    Returns (H, W) masks of regions that are contradicted over most of their area, and of parts that
+    stand exactly still; and, at each pixel, the least motion of the scene's matches near it.
     """
     nowhere = (*np.zeros((2, *still.shape), bool), np.zeros(still.shape))
     _, labels = cv2.connectedComponents(np.uint8(widened(still, FRAME_MARGIN_PX)))
