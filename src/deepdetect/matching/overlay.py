@@ -36,17 +36,17 @@ each image, as Sobel's filter scales them. In 313 pairs without an overlay, none
 MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
 """A match stands still if it moves by less than MAX_STILL_PX, about the error of a keypoint. The
 scene clearly moves at a place if its NEIGHBOURS nearest moving matches move by more than
-MIN_MOTION_PX. At the end of a street, seen from a camera that drives along it, few do so."""
+MIN_MOTION_PX. Where a camera drives along a street, few matches at its end move that far."""
 
 MIN_AREA_PX, MIN_CLEAR_SHARE = 128, 0.67
 """A still region is an overlay if the scene clearly moves at the fraction MIN_CLEAR_SHARE of it,
-and if MIN_AREA_PX of its pixels (half a word of a caption) differ from where the scene moves to. A
-whole window of pixels that shift by less than MAX_SHIFT_PX is enough: 177 real pairs have no
-such pixel, a time stamp has 62, a car's bonnet 7,000."""
+and if MIN_AREA_PX of its pixels (half a word of a caption) look different where the scene moves to.
+A whole window of pixels is enough if they shift by less than MAX_SHIFT_PX: in 177 real pairs, no
+pixel does so, in a time stamp 62 do, in a car's bonnet 7,000."""
 
 MAX_SHIFT_PX, MIN_UNITY, MIN_ROUNDNESS = 0.15, 0.6, 0.5
 """Distant parts of a scene, unlike overlays, shift as a whole: by more than MAX_SHIFT_PX, and by
-more than MIN_UNITY times the median shift of their windows (under a text, windows differ). A
+more than MIN_UNITY times the median shift of their windows (shifts within a text differ). A
 window's shift is known if its structure tensor's determinant exceeds MIN_ROUNDNESS times the
 squared half trace, because an edge that moves along itself looks still."""
 

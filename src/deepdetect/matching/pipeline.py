@@ -118,7 +118,7 @@ def match_images(
     matches = _match_guided(pair, (keypoints0, keypoints1), given, *settings)
     matches = _unmasked(matches, pair, left_out)
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
-        _require_pinholes((image0, image1), rgb, rim=True)  # with an eyepiece, a homography fits
+        _require_pinholes((image0, image1), rgb, rim=True)  # homographies fit eyepieces as well
     if not (mutual and matches.success):
         return matches
     given = None if given is None else given[::-1]

@@ -56,7 +56,7 @@ MAX_DISTANCE_PX = 15.0
 of the given pixel. Chosen by hand."""
 
 MAX_BEND = 0.05
-"""Residuals above this fraction of the control points' extent are not a bend. Chosen by hand."""
+"""Residuals are no bend of the model above this fraction of the points' extent. Chosen by hand."""
 
 READINGS: dict[str, tuple[list[int], float]] = {
     "heights are in feet": ([0, 1, 2], 0.3048),

@@ -24,8 +24,8 @@ MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
 mean square). Otherwise, its depth came from the tested image itself."""
 
 MIN_GAIN = 1.5
-"""An image is moved to a new pose if the number of points that agree grows at least by this factor.
-It grew by at most 1 % for images in their right place, and threefold or more for misplaced ones."""
+"""An image moves to a new pose if the number of points that agree with it grows by this factor or
+more. It grew by at most 1 % for images in their right place, and 3 times or more for others."""
 
 MAX_ROUNDS = 3
 """Images are checked in up to this many rounds, because each correction improves the points."""
