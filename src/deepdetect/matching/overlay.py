@@ -191,7 +191,7 @@ def _contradicted(
     """Find regions of still places that the motion of matches in two reduced images contradicts.
 
     Returns (H, W) masks of regions that are contradicted over most of their area, and of parts that
-    stand exactly still; and, at each pixel, the least motion of the scene's matches near it.
+    stand exactly still; and, for each pixel, the least motion in pixels of scene matches near it.
     """
     nowhere = (*np.zeros((2, *still.shape), bool), np.zeros(still.shape))
     _, labels = cv2.connectedComponents(np.uint8(widened(still, FRAME_MARGIN_PX)))

@@ -56,7 +56,7 @@ MAX_DISTANCE_PX = 15.0
 of the given pixel. Chosen by hand."""
 
 MAX_BEND = 0.05
-"""Residuals are no bend of the model above this fraction of the points' extent. Chosen by hand."""
+"""A bend explains residuals up to this fraction of the control points' extent. Chosen by hand."""
 
 READINGS: dict[str, tuple[list[int], float]] = {
     "heights are in feet": ([0, 1, 2], 0.3048),
@@ -321,7 +321,7 @@ def _check_control_points(
 
 
 def _is_bent(fit: SimilarityFit, targets: np.ndarray) -> bool:
-    """Return whether a bend that grows with the squared distance explains most residuals.
+    """Return whether a bend that grows with the squared distance fits most residuals.
 
     Each point is compared with a prediction from the others, so random errors are not a bend.
     """

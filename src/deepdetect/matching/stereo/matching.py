@@ -45,7 +45,7 @@ MIN_SUPPORT_PX = 5
 SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX, SEARCH_UNIQUENESS_RATIO = 160, 50, 1.3
 """If no disparity range is given, it is found by matching copies of this width. Isolated patches up
 to SEARCH_MAX_SPECKLE_AREA_PX and matches whose runner-up costs under SEARCH_UNIQUENESS_RATIO times
-as much are dropped as mostly false. The range then just covers all of Middlebury's scenes."""
+as much are dropped as mostly false. The ranges found just cover those of Middlebury's scenes."""
 
 TAIL_FRACTION = 0.01
 """This fraction of the disparities at each end of a range is ignored as wrong. Chosen by hand."""

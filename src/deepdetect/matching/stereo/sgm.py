@@ -65,7 +65,7 @@ NOISE_LEVELS = 2.0
 
 MIN_GAIN = 0.2
 """Minimum of the factor by which the fit multiplies the right view's grey values to match the left
-view. If it is lower, the right view shows something else, and the disparity is not refined."""
+view. If the factor is lower, the right view shows something else: a disparity stays unrefined."""
 
 UNKNOWN = np.float32(1e9)
 """This value stands for an unknown disparity: it is too large to share a surface with any other."""
