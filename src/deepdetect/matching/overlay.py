@@ -31,28 +31,28 @@ WINDOW_PX, MAX_DIFFERENCE, MIN_LIKENESS, MIN_GRADIENTS = 7, 0.3, 0.95, 32.0
 """A place looks the same in two images if, in a window of side WINDOW_PX, the difference of their
 gradients is below MAX_DIFFERENCE times the sum of both, or their correlation is above MIN_LIKENESS
 (letters before a brighter ground), and the sum is above MIN_GRADIENTS: 2 grey levels per pixel in
-each image, as Sobel's filter scales them. Neither finds an overlay in 313 pairs without one."""
+each image, as Sobel's filter scales them. In 313 pairs without an overlay, none was found."""
 
 MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
 """A match stands still if it moves by less than MAX_STILL_PX, about the error of a keypoint. The
 scene clearly moves at a place if its NEIGHBOURS nearest moving matches move by more than
-MIN_MOTION_PX. At the end of a street, seen from a camera that drives along it, few do so."""
+MIN_MOTION_PX. Where a camera drives along a street, few matches at its end move that far."""
 
 MIN_AREA_PX, MIN_CLEAR_SHARE = 128, 0.67
 """A still region is an overlay if the scene clearly moves at the fraction MIN_CLEAR_SHARE of it,
-and if MIN_AREA_PX of its pixels (half a word of a caption) differ from where the scene moves to. A
-whole window of pixels that shift by less than MAX_SHIFT_PX is enough: 177 real pairs have no
-such pixel, a time stamp has 62, a car's bonnet 7,000."""
+and if MIN_AREA_PX of its pixels (half a word of a caption) look different where the scene moves to.
+A whole window of pixels is enough if they shift by less than MAX_SHIFT_PX: in 177 real pairs, no
+pixel does so, in a time stamp 62 do, in a car's bonnet 7,000."""
 
 MAX_SHIFT_PX, MIN_UNITY, MIN_ROUNDNESS = 0.15, 0.6, 0.5
 """Distant parts of a scene, unlike overlays, shift as a whole: by more than MAX_SHIFT_PX, and by
-more than MIN_UNITY times the median shift of their windows (under a text, windows differ). A
+more than MIN_UNITY times the median shift of their windows (shifts within a text differ). A
 window's shift is known if its structure tensor's determinant exceeds MIN_ROUNDNESS times the
 squared half trace, because an edge that moves along itself looks still."""
 
 CELL_PX = 32
-"""The motion of the scene is interpolated between squares of this side. Matches are counted by the
-number of squares that contain some."""
+"""The motion of the scene is interpolated between the centres of squares of this side. Still and
+moving matches are compared by the number of squares that contain some."""
 
 SOBEL_GAIN = 8
 """Sobel's 3 x 3 filter returns this multiple of the gradient."""
@@ -116,7 +116,7 @@ def still_matches(
         return places[some], ends[some], ~at_pixels(mask, places[some])
 
     _, found, least = _contradicted(still, small, outside)
-    if found.any():  # matches around what stands still show nothing, because it attracts them
+    if found.any():  # an overlay attracts the matches around it, so they are no evidence
         around = widened(still, FRAME_MARGIN_PX)
         _, found, least = _contradicted(still, small, lambda _: outside(around))
     overlay = found & (least > MIN_MOTION_PX)
@@ -190,8 +190,8 @@ def _contradicted(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find regions of still places that the motion of matches in two reduced images contradicts.
 
-    Returns (H, W) masks of regions that mostly do not move, and of those that stand exactly still;
-    and the least motion of the scene's matches near each pixel.
+    Returns (H, W) masks of regions that are contradicted over most of their area, and of parts that
+    stand exactly still; and, for each pixel, the least motion in pixels of scene matches near it.
     """
     nowhere = (*np.zeros((2, *still.shape), bool), np.zeros(still.shape))
     _, labels = cv2.connectedComponents(np.uint8(widened(still, FRAME_MARGIN_PX)))

@@ -1,4 +1,4 @@
-"""Matching of two images: keypoints, descriptors, ratio test, geometry (paper, Section III-C)."""
+"""Match two images: keypoints, descriptors, geometry (Section III-C of the DeepDetect paper)."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
 """The stages that `match_images` reports."""
 
 MAX_RETURN_ERROR_PX = 2.0
-"""If `mutual`, a match is kept only if the reverse match that starts nearest to its end leads back
-to within this distance of its start. Chosen by hand."""
+"""If `mutual`, images are matched both ways. A match is kept only if the reverse match that starts
+nearest to its end leads back to within this distance of its start. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -119,7 +119,7 @@ def match_images(
     matches = _match_guided(pair, (keypoints0, keypoints1), given, *settings)
     matches = _unmasked(matches, pair, left_out)
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
-        _require_pinholes((image0, image1), rgb, rim=True)  # with an eyepiece, a homography fits
+        _require_pinholes((image0, image1), rgb, rim=True)  # homographies fit eyepieces as well
     if not (mutual and matches.success):
         return matches
     given = None if given is None else given[::-1]
@@ -224,7 +224,7 @@ def match_features(
 
 
 def _noted(matches: Matches, left_out: float) -> Matches:
-    """Add the share of the image that is left out; above 1/2, lower "high" confidence to "fair"."""
+    """Add a share of the image that is left out; above 1/2, turn "high" confidence into "fair"."""
     if (geometry := matches.geometry) is None:
         return matches
     evidence = replace(geometry.evidence, left_out=left_out + geometry.evidence.left_out)

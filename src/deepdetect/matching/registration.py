@@ -35,7 +35,7 @@ from .pipeline import match_images
 Extent = Literal["reference", "union"]
 
 MAX_UNION = 4
-"""The frame of a union has at most this many times the pixels of both images. Chosen by hand."""
+"""Maximum size of a union's frame, as a multiple of the pixels of both images. Chosen by hand."""
 
 SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
@@ -52,7 +52,7 @@ class Registration:
             content. It is uint16 if the second image has more than 8 bits, otherwise uint8. A
             uint16 image keeps its numbers.
         valid: (H, W) bool, where the warped image has content.
-        matches: number of dense matches that were kept.
+        matches: number of dense matches along the homography that were kept.
         zncc: median local ZNCC of both images over their overlap, in [-1, 1].
         origin: (x, y) of the frame's first pixel in the first image; (0, 0) except for "union".
         applied: the images of `apply_to` warped into the frame, (H, W, C) with all their bands and

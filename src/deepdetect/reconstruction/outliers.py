@@ -2,8 +2,8 @@
 
 SOR works as in PCL and Open3D (Rusu et al., "Towards 3D point cloud based object maps for household
 environments", 2008), but in `disparity_space`, where the points of a stereo pair are evenly spaced.
-In a street scene with 3 % outliers, it removed 96 % of them and no other points. In 3D space, SOR
-would have removed only 10 % of them.
+In a simulated street with 3 % random disparities, SOR removed 96 % of these and no other points.
+Applied to the 3D points instead, it removed only 10 % of them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class PointFilterOptions:
             it is the minimum disparity, including the disparity offset.
         sor_neighbors: number of nearest neighbours in `disparity_space` with which SOR (statistical
             outlier removal) compares a point; 0 turns SOR off. For rectified pairs, any other
-            number means all points in a window of pixels.
+            number means all points in a window of 9 x 9 pixels.
         sor_std_ratio: a point is an outlier if its distance from its neighbours is above the mean
             of all points by more than this number of standard deviations.
 

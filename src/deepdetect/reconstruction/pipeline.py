@@ -48,9 +48,9 @@ SOR_WINDOW_PX = 9
 window with this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
-"""Minimum fractions of keypoints with a match on their row. MIN_UNIQUE_FRACTION is used if matches
-must be unique: unrelated images had up to 0.005, and rectified pairs at least 0.35. Otherwise
-MIN_MATCHED_FRACTION is used: unrelated images had up to 0.16, rectified pairs at least 0.64."""
+"""Minimum fraction of keypoints that find a match on their row. If matches must be unique, it is
+MIN_UNIQUE_FRACTION: unrelated photographs had up to 0.005, rectified pairs at least 0.35. Otherwise
+it is MIN_MATCHED_FRACTION: unrelated photographs had up to 0.16, rectified pairs at least 0.64."""
 
 
 @suggest_keywords
@@ -86,7 +86,7 @@ def reconstruct(
         selection: which pixels of a heat map become keypoints; None takes those with a probability
             above 0.5. With a density of 1, every pixel of a rectified pair becomes a point, with
             the disparity options `DENSE`. `subpixel` is ignored.
-        ignore: masks as in `match_images`; for a rectified pair, only the mask of the left image.
+        ignore: masks as in `match_images`. A rectified pair only uses the mask of the left image.
         seed: seed of all random choices.
         point_filter: which points are kept.
         progress: called with the name of each stage when it ends.

@@ -1,7 +1,7 @@
 """Recognise rectified pairs, and check that the calibration fits them and that they show depth.
 
-The matches of a rectified pair lie on the same row in both images. A pair is rectified if about as
-many matches do so as fit a fundamental matrix.
+In a rectified pair, both points of a match lie on the same image row. A pair is taken as rectified
+if about as many of its matches do so as fit a fundamental matrix.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ MAX_ROW_DISTANCE_PX = 1.0
 of the principal point) of both views by at most twice this. Chosen by hand."""
 
 MIN_INLIER_RATIO = 0.9
-"""A pair is rectified only if its matches on the same row number at least this fraction of the
-inliers of a fundamental matrix. It shows a plane if those of a homography do. Chosen by hand."""
+"""A pair is rectified only if its same-row matches number at least this fraction of a fundamental
+matrix's inliers. If a homography's inliers do so, the pair shows a plane. Chosen by hand."""
 
 MIN_DISPARITY_SPREAD_PX = 2.0
 """A pair is rectified only if its disparities spread by at least this from the 5th to the 95th
-percentile. Matches at whole pixels always spread by 1, because their positions are rounded."""
+percentile. Rounding to whole pixels alone can spread equal disparities by 1 px."""
 
 MIN_PLANAR_SPREAD_PX = 8.0
-"""If one homography explains all matches, a pair is rectified only if its disparities spread by at
-least this, as on a slanted plane. Small rotations of the camera spread disparities less."""
+"""If one homography fits nearly all matches, a pair is rectified only if its disparities spread by
+at least this (5th to 95th percentile), as on a slanted plane. Small rotations spread them less."""
 
 GRID_SIZE_PX = 8
-"""One match is taken from each cell of the left image; cells have this side. Chosen by hand."""
+"""A pair is tested with one match per square of this side in the left image. Chosen by hand."""
 
 MIN_COARSE_INLIERS = 50
-"""The coarse pass decides only if at least this number of matches fit a fundamental matrix."""
+"""Small copies of the images can only decide if this many matches fit a fundamental matrix."""
 
 MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
 """The focal lengths of rectified views may differ by at most this fraction, so that values rounded
@@ -57,21 +57,21 @@ MAX_BEHIND_FRACTION = 0.25
 """Maximum fraction of points behind the cameras for a correct calibration. Chosen by hand."""
 
 MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
-"""A rotation explains a disparity if its error is below MAX_ROTATION_ERROR_PX. A pair is rejected
-as a pure rotation only if the best rotation explains more than MIN_ROTATION_FRACTION of its
-disparities. For four views that were rotated by 0.5 to 2 degrees, the fraction was 0.64 or more."""
+"""A disparity fits a rotation if its error is below MAX_ROTATION_ERROR_PX. A pair is rejected as a
+pure rotation only if more than MIN_ROTATION_FRACTION of its disparities fit the best rotation: in
+four Middlebury views, rotated by 0.5 to 2 degrees, at least 0.64 of them did."""
 
 MAX_RATIO_TO_PLANE = 0.5
 """A pair is rejected as a pure rotation only if the median error of the disparities under the best
-rotation, divided by that under the best plane, is below this. The ratio was up to 0.33 for rotated
-views, and at least 5.3 for slanted walls."""
+rotation, divided by that under the best plane, is below this. The ratio was up to 0.33 for four
+rotated Middlebury views, and at least 5.3 for four images drawn on slanted walls."""
 
 ROBUST_ITERATIONS = 12
 
 ROTATION_GRID_SIZE_PX, MIN_ROTATION_MATCHES, MAX_ROTATION_SAMPLES = 16, 30, 50_000
-"""A rotation is fitted to one disparity per cell with the side ROTATION_GRID_SIZE_PX, if there are
-at least MIN_ROTATION_MATCHES. At most MAX_ROTATION_SAMPLES random disparities are considered.
-Chosen by hand."""
+"""A rotation is fitted to one disparity per image square of side ROTATION_GRID_SIZE_PX, and only if
+there are at least MIN_ROTATION_MATCHES of them. They are taken from at most MAX_ROTATION_SAMPLES
+random disparities. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ class Rectification:
         reason: why the pair is not rectified; empty if it is.
         swapped: whether the pair is rectified, but left and right are exchanged.
         on_rows: number of `matches` whose rows in the two images differ by at most one pixel.
-        by_fundamental: number of matches that a fundamental matrix explains with that tolerance.
-        matches: number of matches that were used, one per cell of the left image.
-        disparities: 5th percentile, median and 95th percentile of the disparities of the matches on
-            rows, in pixels; NaN if there are none.
+        by_fundamental: number of `matches` that fit a fundamental matrix with the same tolerance.
+        matches: number of matches that were tested, one per square of 8 px in the left image.
+        disparities: 5th percentile, median and 95th percentile of the disparities, in pixels, of
+            the matches on the same row; NaN if there are none.
     """
 
     rectified: bool
@@ -121,14 +121,14 @@ def find_rectification(
 def _coarse_pass(
     sources: Sources, size: tuple[int, int], offset_px: float, seed: int
 ) -> Rectification | None:
-    """Recognise in small copies that a pair is not rectified; None if these do not suffice."""
+    """Recognise in small copies that a pair is not rectified; None if they leave this open."""
     coarse = sources.learned
     scale = 1 / coarse.pixel
     if scale == 1:
         return None
     small = round(size[0] * scale), round(size[1] * scale)
     matched = scaled_points(coarse.points0, scale), scaled_points(coarse.points1, scale)
-    # A distance of 1 px in the copies is more at full size, so the limit for rows is generous.
+    # One pixel in the copies is more at full size, so more matches count as on the same row.
     found = detect_rectification(*matched, small, offset_px * scale, seed)
     few = found.by_fundamental < MIN_COARSE_INLIERS
     if few or found.rectified or 2 * found.on_rows >= found.by_fundamental:
@@ -157,7 +157,7 @@ def detect_rectification(
     spread = np.quantile(disparity, [0.05, 0.5, 0.95]) if len(disparity) else np.full(3, np.nan)
     on_rows_count, best = (int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers))
     reason = ""
-    # Rows have no fitted parameters, so the NFA (false alarms) of a fundamental matrix is stricter.
+    # "On the same row" has no fitted parameters, so the NFA of a fundamental matrix is stricter.
     if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     elif on_rows_count < MIN_INLIER_RATIO * best:

@@ -39,10 +39,10 @@ AFFINITY_REGULARIZATION = 20.0
 much as this number of matches, in case the matches are few or on one line. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES, SIMILARITY_ITERATIONS = 5000, 20
-"""The similarity fit uses up to MAX_SIMILARITY_SAMPLES matches in SIMILARITY_ITERATIONS steps."""
+"""Limits of the robust similarity fit: number of matches, evenly sampled, and of iterations."""
 
 CORNER_WINDOW_PX = 7
-"""The strength of a corner is measured in a window with this side, about the side of a patch."""
+"""Side of the window in which the strength of a corner is measured, about that of a patch."""
 
 
 def refine_matches(
@@ -72,7 +72,7 @@ def refine_matches(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of (N, 2) pixels: the best Shi-Tomasi corner in each of `count` cells."""
+    """Return, for about `count` squares, the index of the strongest corner among (N, 2) pixels."""
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
     side = np.sqrt(gray.size / count)

@@ -28,24 +28,24 @@ MAX_EPIPOLAR_DISTANCE_PX, MAX_REPROJECTION_ERROR_PX = 1.0, 0.5
 root mean square reprojection error below MAX_REPROJECTION_ERROR_PX. Chosen by hand."""
 
 POSE_CELLS, GRID_SIZE_PX = 10_000, 16
-"""The pose is estimated from the best corner in each of about POSE_CELLS cells. The checks use one
-match from each cell with the side GRID_SIZE_PX, because neighbouring matches are not independent
-evidence. Chosen by hand."""
+"""The pose is estimated from the strongest corner in each of about POSE_CELLS squares of the first
+image. It is checked with one match per square of side GRID_SIZE_PX, because neighbouring matches
+are not independent evidence. Chosen by hand."""
 
 MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
-"""A pose explains a match if the Sampson distance is below this, as for a fundamental matrix."""
+"""Maximum Sampson distance of a match that fits a pose, the same as for a fundamental matrix."""
 
 MIN_POSE_RATIO, MIN_IN_FRONT_FRACTION = 0.75, 0.75
-"""A pose is accepted only if it explains at least MIN_POSE_RATIO times as many matches as the
-fundamental matrix (a correct calibration gives about 1), and if the fraction MIN_IN_FRONT_FRACTION
-of its inliers lies in front of both cameras. Chosen by hand."""
+"""A pose is accepted only if at least MIN_POSE_RATIO times as many matches fit it as fit the
+fundamental matrix (a correct calibration gives about 1), and if at least MIN_IN_FRONT_FRACTION of
+its inliers lie in front of both cameras. Chosen by hand."""
 
 FOCAL_FACTORS, MAX_FOCAL_ERROR_RATIO = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0), 0.5
-"""A focal length is rejected if multiplying it by one of FOCAL_FACTORS reduces the median error
-below MAX_FOCAL_ERROR_RATIO times its value. A focal length wrong by a fifth is still accepted."""
+"""A focal length is rejected if multiplying it by one of FOCAL_FACTORS reduces the median Sampson
+distance to less than MAX_FOCAL_ERROR_RATIO of its value. An error of a fifth is not noticed."""
 
 GOOD_ERROR_PX = 0.1
-"""No other focal length is tried if the given one has a median error below this. Chosen by hand."""
+"""No other focal length is tried if the median Sampson distance is below this. Chosen by hand."""
 
 NO_DEPTH = {
     "none": "the matches agree with no geometry: the images do not overlap, show different scenes, "
@@ -59,9 +59,9 @@ NO_DEPTH = {
 
 
 def scene_with_depth(matches: Matches) -> tuple[Matches, np.ndarray]:
-    """Return the matches of a scene and its (3, 3) fundamental matrix.
+    """Return the matches of the main scene (layer 0), and its (3, 3) fundamental matrix.
 
-    Raises a NoDepthError if the scene of guided matches shows no depth.
+    Raises a NoDepthError if the geometry of the matches shows no depth (`NO_DEPTH`).
     """
     geometry = matches.geometry
     assert geometry is not None
@@ -168,8 +168,8 @@ def check_pose(
 ) -> RelativePose:
     """Return the given pose, or raise a ReconstructionError if the calibration is wrong.
 
-    The calibration is wrong if, of the matches with the indices `cells` (K,), the pose explains far
-    fewer than the fundamental matrix. `explained` (K,) bool is what that matrix explains.
+    `cells` (K,) are the indices of the tested matches; `explained` (K,) bool tells which of them
+    fit the fundamental matrix. The calibration is wrong if far fewer of them fit the pose.
     """
     wrong_focal = _wrong_focal(calibration)
     if pose is None:

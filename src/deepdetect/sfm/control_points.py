@@ -29,7 +29,7 @@ Each value lists the header words for its column, in lower case and without punc
 
 
 class ControlRow(NamedTuple):
-    """A ground control point in an image. `place` is its latitude, longitude and height.
+    """A ground control point at pixel `xy` of an image; `place` is latitude, longitude, height.
 
     The height is in metres, NaN if unknown. `heights` says what the height is measured from.
     """

@@ -20,7 +20,7 @@ HIDDEN = np.uint64(1) << np.uint64(63)
 
 MIN_TEXTURE = np.float32(0.18)
 """A window has texture if the variance of its gradients along the epipolar line exceeds this
-multiple of the noise's variance. Plain skies with JPEG artefacts do not, weathered stone does."""
+multiple of the noise's variance. Skies with JPEG artefacts have less, weathered stone has more."""
 
 MIN_GAIN = np.float32(0.2)
 """A window's shift is divided by its contrast relative to the matching window of a neighbour.
@@ -29,7 +29,7 @@ Ratios below `MIN_GAIN` are raised to `MIN_GAIN`, so that the shift does not bec
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write to `line` (D, W) the two least Hamming distances to neighbours in row `y`, summed."""
+    """Write to `line` (D, W) the sums of row y's two least Hamming distances to neighbours."""
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
     for d in range(count):
@@ -284,8 +284,8 @@ def refine_rows(  # type: ignore[no-untyped-def]
 
     `planes` are as in `fit_rows`, for every `stride`-th pixel of `gray` in both directions, but
     with slopes per pixel of `gray`. `neighbours` (K, H', W') float32 are padded images of (width,
-    height) `sizes` (K, 2). `maps` (K, 3, 4) are A and b side by side. Every `spacing`-th pixel of a
-    window is compared if its inverse depth is within `tolerance` of the middle pixel's plane.
+    height) `sizes` (K, 2). `maps` (K, 3, 4) are as in `relative_projections`. Every `spacing`-th
+    pixel of a window is compared if its inverse depth is within `tolerance` of the middle's plane.
 
     The new inverse depth `out` is NaN if fewer than `min_number` neighbours reach
     `min_correlation`, and unchanged if these have no texture along the epipolar line. In both
@@ -343,8 +343,8 @@ def fuse_rows(  # type: ignore[no-untyped-def]
     """Write, for each pixel of the first map, the mean inverse depth of the maps that agree on it.
 
     The first map `planes` and the padded `neighbours` (K, H', W', 3) are as in `refine_rows`.
-    `sizes` (K, 2) are the rows and columns of the neighbours. `there` (K, 3, 4) are A and b from
-    the first image to each neighbour, `back` (K, 3, 4) those in the other direction. `rays` (3, 3)
+    `sizes` (K, 2) are the rows and columns of the neighbours. `there` (K, 3, 4) project the first
+    image to each neighbour, as in `relative_projections`, and `back` the other way. `rays` (3, 3)
     maps pixels (x, y, 1) to lines of sight. `centres` (K, 3) are the neighbours' camera centres in
     the frame of the first camera.
 

@@ -1,8 +1,8 @@
 """Compute depth maps of images whose cameras are known.
 
-Semi-global matching of downscaled images gives inverse depths, to which planes are fitted. Pixels
-that correlate badly may take the plane of another pixel. Full-size grey images then refine all
-planes. A pixel without texture gets a depth only between textured pixels of the same surface.
+Semi-global matching of downscaled images gives inverse depths, to which planes are fitted. A pixel
+whose plane matches other images badly may take that of another pixel. Planes are then refined on
+full-size images. Pixels without texture get a depth only between textured ones of their surface.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ MAX_SIDE_PX, CACHED_IMAGES = 2000, 16
 process caches `CACHED_IMAGES` undistorted images, because successive images share neighbours."""
 
 SMALL_SCALE, MAX_VOLUME = 0.5, 3e7
-"""Semi-global matching scales images by at most SMALL_SCALE (half the scale takes 1/8 of the time).
-It uses at most MAX_VOLUME costs (pixels times inverse depths), to save memory."""
+"""Semi-global matching scales images to at most SMALL_SCALE (half the scale takes 1/8 of the time),
+and computes at most MAX_VOLUME costs (pixels times inverse depths), to save memory."""
 
 TAIL_FRACTION, DEPTH_MARGIN, MIN_FAR = 0.002, 0.2, 0.1
 """The search range spans the inverse depths of the sparse points, except for `TAIL_FRACTION` of
@@ -53,8 +53,8 @@ MAX_APPROACH = 0.5
 other camera has moved ahead by more than this fraction of it. Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
-"""The search steps through inverse depths so that matches move by one pixel per step, at this
-quantile of all matches: the median, because matches near the epipole hardly move."""
+"""A step of the search through inverse depths moves matches by one pixel, at this quantile of all
+matches: the median, because matches near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
 """Two inverse depths belong to one surface if their matches in the downscaled images of the search
@@ -66,7 +66,7 @@ with tolerances in steps of the search: first a wide one, so that frontal planes
 as the ground. Fits to under `MIN_FITTED` pixels are dropped as wrong. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
-"""Radius of the compared windows, and spacing of the pixels read in them. Chosen by hand."""
+"""Radius of the windows compared between images, and spacing of their pixels. Chosen by hand."""
 
 BLUR_SIGMA_PX, NOISE_LEVELS = 1.0, 1.0
 """A blur of BLUR_SIGMA_PX lets the pixels read in a window represent the pixels between them. Noise
@@ -182,7 +182,7 @@ def _search(
     size = np.array(own.shape[::-1])
     # Neighbours are warped by the homography of the middle depth. For any other depth, the warped
     # image then only has to be shifted and scaled as a whole.
-    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # [k, first or last, x or y]
+    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # [image, first or last, x or y]
     for view, places in zip(small[1:], corners, strict=True):
         matrix, vector = relative_projection(small[0], view)
         warp = matrix + middle * np.outer(vector, [0, 0, 1])
@@ -329,7 +329,7 @@ def relative_projections(
 
 
 def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> float:
-    """Return how far the median match moves, in pixels per unit of inverse depth, at a depth."""
+    """Return the pixels that the median match moves per unit of inverse depth, at a given depth."""
     matrix, vector = relative_projection(first, second)
     x, y = (np.linspace(0, side - 1, 7)[1:-1] for side in first.camera.size)
     pixels = np.array([[across, down, 1] for across in x for down in y])

@@ -30,8 +30,8 @@ LAZ_STEP_M = 0.001
 
 MESH_MARGIN, MESH_DEPTHS, MESH_TRIM = 0.5, (6, 12), 3
 """A mesh uses the points in their robust bounding box, extended on each side by `MESH_MARGIN` of
-its size. `MESH_DEPTHS` limits the depth of its octree. Surfaces are trimmed where the octree is
-more than `MESH_TRIM` levels coarser. Chosen by hand."""
+its size. `MESH_DEPTHS` limits the number of levels of its octree. The surface is cut away where
+sparse points make the octree over `MESH_TRIM` levels coarser. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
 """A mesh needs this number of points: with only a handful, COLMAP's meshing crashes the process."""

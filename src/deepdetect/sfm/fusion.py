@@ -23,8 +23,8 @@ MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
 `MIN_ALL_VIEWS` images contain the point in their frame and all of them agree. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
-"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the rule for
-`ENOUGH_VIEWS`: near edges, windows give the background the foreground's depth. Chosen by hand."""
+"""Pixels on the near side of a depth edge, up to this distance from it, must satisfy the rule of
+`ENOUGH_VIEWS`: windows there give the background the foreground's depth. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
 """A pixel in the middle of a surface needs only `MIN_VIEWS` images that agree, because most wrong
@@ -145,7 +145,7 @@ def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
 
 
 def nearest_depths(view: PosedView, parts: Sequence[np.ndarray], stride_px: int) -> np.ndarray:
-    """Return the least depth of the points in each cell of a view, or infinity in empty cells."""
+    """Return the least depth of points in each square of `stride_px` in a view, else infinity."""
     columns, rows = (-(-side // stride_px) for side in view.camera.size)
     nearest = np.full((rows, columns), np.inf)
     for points in parts:

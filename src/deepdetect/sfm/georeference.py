@@ -38,10 +38,10 @@ control points, which are surveyed to centimetres and marked to within a few pix
 
 MAX_SCALE_STD, MAX_HEADING_STD_DEG = 0.25, 20.0
 """A model is georeferenced only if the relative standard deviation of its scale, and the standard
-deviation of its direction to north, are below these. Chosen by hand."""
+deviation of its direction to north, are below these limits. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""A note is made if the positions alone leave a rotation about any axis less certain than this."""
+"""A note says if the positions alone leave some rotation's standard deviation above this."""
 
 GRAVITY_STD_DEG, UPRIGHT_STD_DEG, AHEAD_STD_DEG = 2.0, 5.0, 25.0
 """Assumed standard deviations: of a gimbal's angles; without a gimbal, of image rows from level,
@@ -56,7 +56,7 @@ MAX_DISTANCE_PX = 15.0
 of the given pixel. Chosen by hand."""
 
 MAX_BEND = 0.05
-"""Residuals above this fraction of the control points' extent are not a bend. Chosen by hand."""
+"""A bend explains residuals up to this fraction of the control points' extent. Chosen by hand."""
 
 READINGS: dict[str, tuple[list[int], float]] = {
     "heights are in feet": ([0, 1, 2], 0.3048),
@@ -252,7 +252,7 @@ def _place(
     scale: float | None,
     error: float | None = None,
 ) -> Georeference:
-    """Fit a model to places; `error` is the error of control points in units of the model."""
+    """Fit a model's `points` to geographic `places`; control points have an `error` in its unit."""
     unknown = np.isnan(places[:, 2])
     places = np.where(np.isnan(places), 0 if unknown.all() else np.nanmedian(places[:, 2]), places)
     places[:, 1] = np.unwrap(places[:, 1], period=360)
@@ -321,7 +321,7 @@ def _check_control_points(
 
 
 def _is_bent(fit: SimilarityFit, targets: np.ndarray) -> bool:
-    """Return whether a bend that grows with the squared distance explains most residuals.
+    """Return whether a bend that grows with the squared distance fits most residuals.
 
     Each point is compared with a prediction from the others, so random errors are not a bend.
     """

@@ -24,8 +24,8 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
 MIN_VERIFIED = 30
-"""A pair of images is used only if its two-view geometry has at least this number of inliers. About
-20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
+"""A pair of images is used only if its two-view geometry has at least this many inliers. Unrelated
+images of 8,192 keypoints have about 20, and slowed the mapping of mixed folders down tenfold."""
 
 MAX_VERIFICATION_ERROR_PX, MAX_TRIALS = 4.0, 5000
 """An inlier's error is at most MAX_VERIFICATION_ERROR_PX (COLMAP's default). RANSAC draws at most
@@ -39,9 +39,9 @@ MAX_MODELS, MAX_FIRST_PAIRS = 5, 20
 MAX_FIRST_PAIRS pairs of images are tried as the first pair. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
-"""The mapping begins with two images whose lines of sight form 16 degrees, and between which the
-camera did not move straight ahead, as in COLMAP. If no pair qualifies, or more connected images are
-left out than mapped, a retry allows forward motion and angles down to this. Chosen by hand."""
+"""The mapping begins with two images whose lines of sight form over 16 degrees, and between which
+the camera did not move straight ahead, as in COLMAP. If no pair qualifies, or more connected images
+are left out than mapped, a retry allows forward motion and angles down to this. Chosen by hand."""
 
 ROBUST_SCALE_PX, MAX_REFINED_ERROR_PX = 1.0, 1.0
 """`ROBUST_SCALE_PX` is the scale of the Cauchy loss in bundle adjustment, chosen by hand. In
@@ -68,7 +68,7 @@ USUAL_DISTORTION = 0.05
 distance from the centre. SLRs stay below this, fisheyes of 100 degrees reach 0.14."""
 
 LENSES = {"RADIAL": (0.0, 0.0), "RADIAL_FISHEYE": (1 / 3, 2 / 15)}
-"""Camera models to compare, and what is added to a pinhole's distortion: the series of tan(x)."""
+"""Compared camera models. These coefficients of tan(x) let a fisheye's fit begin as a pinhole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +307,7 @@ def require_pinholes(model: Any) -> None:
         if not suspects:
             return
         adjust(fitted, False, ROUGH_TOLERANCE)
-        # A few wrong points have errors of any size.
+        # Errors are limited, because a few wrong points can have errors of any size.
         errors = {
             n: min(each.error, MAX_VERIFICATION_ERROR_PX) for n, each in fitted.points3D.items()
         }

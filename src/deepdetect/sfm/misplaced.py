@@ -24,15 +24,15 @@ MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
 mean square). Otherwise, its depth came from the tested image itself."""
 
 MIN_GAIN = 1.5
-"""An image is moved to a new pose if the number of points that agree grows at least by this factor.
-The factor was within 1 % of 1 for images in their right place, and 3 or more for misplaced ones."""
+"""An image moves to a new pose if the number of points that agree with it grows by this factor or
+more. It grew by at most 1 % for images in their right place, and 3 times or more for others."""
 
 MAX_ROUNDS = 3
-"""Images are checked in at most this number of rounds: corrected images improve the points."""
+"""Images are checked in up to this many rounds, because each correction improves the points."""
 
 MIN_KEPT = 0.9
-"""A correction is undone if less than this fraction of the observations is left when all points are
-triangulated again. The fraction was 0.99 where a correction helped."""
+"""A correction is undone if, after all points are triangulated again, the model has less than this
+fraction of its former observations. Where a correction helped, the fraction was 0.99."""
 
 
 def correct_places(
@@ -126,7 +126,7 @@ class _Points:
     def matched(
         self, number: int, matches: Iterable[tuple[int, np.ndarray]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return indices of an image's keypoints, and of their points with depth from other images.
+        """Return matched indices: keypoints of an image, points with depth from other images.
 
         `matches` are other images, each with (M, 2) indices of matching keypoints in both images.
         """

@@ -26,8 +26,8 @@ SPLAT_POINTS = 200_000
 JPEG_QUALITY = 95
 
 CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
-"""Points cover squares in a depth map. Their side is the first in `CELLS_PX` whose successor covers
-less than `CLOSED_GAIN` times the area: few gaps are left then. Chosen by hand."""
+"""Each point covers a square of a depth map. Its side in pixels is the first of `CELLS_PX` at which
+the next would cover under `CLOSED_GAIN` times the area: few gaps are left then. Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
 """A pixel whose depth exceeds a neighbour's by more than this fraction is left out: it is seen

@@ -67,7 +67,7 @@ from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
-"""The choice "auto" matches all pairs if there are at most this number of images."""
+"""The option `pairs="auto"` matches all pairs of at most this many images."""
 
 WORK = "work"
 """Name of the folder of intermediate results, inside the output folder."""
@@ -77,8 +77,8 @@ LINKS = ".images"
 folder is hidden, so that a search for images in a folder above does not find them twice."""
 
 COMPARED_RUNS = 8
-"""An overlay is searched for in this number of runs of three images, spread over all images: images
-with successive names are mostly from one camera. Chosen by hand."""
+"""An overlay is searched for in this many groups of three images with successive names, which are
+mostly from one camera. The groups are spread over all images. Chosen by hand."""
 
 
 @suggest_keywords
@@ -253,7 +253,7 @@ class Stages:
                 if name in described:
                     width, height = file[name]["image_size"][()]
                     wide = width >= MIN_ASPECT * height
-                    looked = wide or not sizes  # for a fisheye's rim, until one image has none
+                    looked = wide or not sizes  # a fisheye's rim, until one image has none
                     try:
                         require_pinhole(path, load_image(path) if looked else None)
                     except ValueError as error:
@@ -269,7 +269,7 @@ class Stages:
         return sizes, keypoints, failures
 
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
-        """Return the pairs of images to match, chosen as the option `pairs` says."""
+        """Return the pairs of images to match, chosen by the rule in the option `pairs`."""
         choice = self.options.pair_choice(len(names))
         if not (alike := similar(choice)):
             return list_pairs(choice, names)

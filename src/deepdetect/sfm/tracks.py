@@ -38,8 +38,8 @@ the direction to that camera exceeds `MIN_FACING`, its area there changes by a f
 `MAX_GROWTH`, and the images share at least `MIN_COMMON_POINTS` points. Chosen by hand."""
 
 DENSE_CELLS, MIN_DISTANCE_PX = 4500, 3
-"""An image is divided into `DENSE_CELLS` cells. Each begins at most one dense track, farther than
-`MIN_DISTANCE_PX` from all earlier tracks in the image. Chosen by hand."""
+"""An image is divided into about `DENSE_CELLS` squares. In each, at most one dense track begins,
+farther than `MIN_DISTANCE_PX` from all earlier tracks in the image. Chosen by hand."""
 
 MIN_DENSE_VIEWS = 3
 """A dense track needs at least this number of images: a third image checks the match of two."""
@@ -139,7 +139,7 @@ class _Tracks:
         self.read = lru_cache(max(CACHED_IMAGES, int(CACHED_PIXELS / largest)))(self._read)
 
     def corners(self, name: str, points: np.ndarray) -> Surfaces:
-        """Choose dense points of an image to begin tracks: the best corner of each grid cell."""
+        """Choose dense points that begin tracks: the strongest corner in each grid square."""
         image = self.images[self.numbers[name]]
         xy = image.intrinsics.from_pinhole(image.view.project(points["points"])[0])
         pixels = np.rint(xy).astype(np.int64).clip(0, np.array(image.intrinsics.size) - 1)
@@ -149,7 +149,7 @@ class _Tracks:
         return Surfaces(pixels[rows], places, normals)
 
     def free(self, name: str, pixels: np.ndarray) -> np.ndarray:
-        """From pixels (K, 2) of an image, return the indices of those that are near no track."""
+        """Return the indices of those pixels (K, 2) of an image that are near no track."""
         number = self.numbers[name]
         free = np.ones(self.images[number].intrinsics.size[::-1], np.uint8)
         for _, xy in self.seen[number]:

@@ -12,7 +12,7 @@ import numpy as np
 from ..._shared.kernels import compiled
 
 END = np.uint16(30000)
-"""Cost of disparities outside the range: above any sum, and below 2^16 after adding a penalty."""
+"""Cost of disparities outside the searched range: above any sum, with a penalty below 2^16."""
 
 BLOCK = 128
 """Number of pixels of a row that are processed together, so that the sums stay in the L1 cache."""
@@ -33,7 +33,7 @@ def census_rows(first, last, padded, out):  # type: ignore[no-untyped-def]
     for y in range(first, last):
         out[y] = 0
         here = padded[y + radius_y, radius_x:]
-        for start in range(0, bits, 8):  # bytes: a vector register holds more of them than words
+        for start in range(0, bits, 8):  # bytes, as a vector register holds more bytes than words
             end = min(start + 8, bits)
             part[:] = 0
             for bit in range(start, end):
@@ -140,7 +140,7 @@ def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # typ
     lines[:, :, 0] = lines[:, :, count + 1] = END
     leasts = np.zeros(paths, np.uint16)
     tones = np.zeros(paths, np.uint8)
-    for k in range(paths * steps):  # in memory order
+    for k in range(paths * steps):  # in the order in memory
         if down:
             step, path = k // paths, k % paths
             y = step if down == 1 else height - 1 - step
@@ -172,7 +172,7 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
     """
     width = total.shape[1]
     best = np.empty(width, np.int64)
-    keys = np.empty(width, np.uint32)  # of the mirrored right row, as in `_distances`
+    keys = np.empty(width, np.uint32)  # by column of the mirrored right row: cost and disparity
     for y in range(first, last):
         keys[:] = np.uint32(0xFFFFFFFF)
         for x in range(width):
@@ -391,7 +391,7 @@ def extrapolate_rows(  # type: ignore[no-untyped-def]
             predicted = _line_at(sums, reach, 2 * reach, 0.0)
             if abs(predicted - _line_at(sums, 0, reach, 0.0)) > max_difference:
                 break
-            # `carried` is rounded by up to half a pixel.
+            # `carried` is an integer, so it may be off by half a pixel.
             if abs(carried[y, x] - disparity[y, start]) > max_difference + np.float32(0.5):
                 continue
             continued = _line_at(sums, 0, 2 * reach, np.float64(x - start))

@@ -43,16 +43,16 @@ MIN_SUPPORT_PX = 5
 """Lines that extrapolate a surface are fitted to at least this many pixels. Chosen by hand."""
 
 SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX, SEARCH_UNIQUENESS_RATIO = 160, 50, 1.3
-"""If no range is given, copies of this width are matched. Patches up to SEARCH_MAX_SPECKLE_AREA_PX
-are dropped, and matches whose runner-up costs less than SEARCH_UNIQUENESS_RATIO times as much:
-most are false. The range then just covers the Motorcycle pair and Middlebury's scenes."""
+"""If no disparity range is given, it is found by matching copies of this width. Isolated patches up
+to SEARCH_MAX_SPECKLE_AREA_PX and matches whose runner-up costs under SEARCH_UNIQUENESS_RATIO times
+as much are dropped as mostly false. The ranges found just cover those of Middlebury's scenes."""
 
 TAIL_FRACTION = 0.01
-"""This fraction of disparities at each end of the range counts as unreliable. Chosen by hand."""
+"""This fraction of the disparities at each end of a range is ignored as wrong. Chosen by hand."""
 
 SEARCH_MARGIN_PX, SEARCH_MARGIN_FRACTION = 1.5, 0.2
-"""The range is extended at both ends by SEARCH_MARGIN_PX, in pixels of the small copy, plus
-SEARCH_MARGIN_FRACTION times its length, because some objects are too small for the copy."""
+"""A disparity range found on small copies is extended at both ends by SEARCH_MARGIN_PX (pixels of
+the copy) and SEARCH_MARGIN_FRACTION of its length, as some objects are too small for the copy."""
 
 
 @suggest_keywords

@@ -42,8 +42,8 @@ SAMPLED_ROW_STEP = 48
 P1_BITS, P2_BITS, MIN_P2_BITS, P2_HALF_GRADIENT_LEVELS = 20, 100, 25, 8
 """Penalties, in census bits per pixel. `P1_BITS` is for a disparity that changes by one pixel along
 a path. For larger changes, the penalty is `P2_BITS` where the grey level is constant, half of it
-where neighbours differ by `P2_HALF_GRADIENT_LEVELS`, and at least `MIN_P2_BITS`. The best of a few
-values on the Motorcycle pair were chosen; noisy images of full size would need larger ones."""
+where neighbours differ by `P2_HALF_GRADIENT_LEVELS`, and at least `MIN_P2_BITS`. These are the best
+of a few values on Middlebury's Motorcycle; noisy images of full size would need larger ones."""
 
 OUTSIDE_COST = 0.6
 """Cost of a match outside the right image, where 0 is the pair's median match and 1 a wrong match.
@@ -53,19 +53,19 @@ MAX_DIFFERENCE_PX = 1.0
 """Disparities of neighbours on one surface differ by at most this. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
-"""Radius in pixels of the windows in which the grey values are fitted. This and the constants below
-were chosen on the Motorcycle pair."""
+"""Radius of the windows in which grey values are fitted. Chosen on Middlebury's Motorcycle."""
 
 SMOOTHING_RADII_PX, FINAL_SMOOTHING_RADIUS_PX = (4, 4), 2
 """Radii of windows in which the disparities of one surface are averaged: before each iteration of
-the fit, to reduce the bias of the parabola, and after the last iteration."""
+the fit, to reduce the bias of the parabola, and after the last iteration. Like `NOISE_LEVELS` and
+`MIN_GAIN`, they were chosen on Middlebury's Motorcycle pair."""
 
 NOISE_LEVELS = 2.0
 """Gradients below this, in grey levels per pixel, are noise: the averaged disparity is kept."""
 
 MIN_GAIN = 0.2
 """Minimum of the factor by which the fit multiplies the right view's grey values to match the left
-view. If the factor is lower, the right view shows something else, and no disparity is refined."""
+view. If the factor is lower, the right view shows something else: a disparity stays unrefined."""
 
 UNKNOWN = np.float32(1e9)
 """This value stands for an unknown disparity: it is too large to share a surface with any other."""

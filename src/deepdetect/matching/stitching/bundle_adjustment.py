@@ -30,8 +30,8 @@ FOCAL_LENGTHS = np.geomspace(0.3, 10, 100) * 640 / UNIT_PX
 side of the images for registration."""
 
 FOCAL_WEIGHT = 1e-4
-"""Weight of the term that keeps all focal lengths equal: a difference of 10 % costs as much as a
-residual of 0.5 px."""
+"""Weight of the term that keeps all focal lengths equal: a camera whose focal length is off by 10 %
+costs as much as a match with a residual of 0.5 px."""
 
 Matrices = Mapping[int, np.ndarray]
 """A (3, 3) matrix for each image number."""

@@ -30,8 +30,8 @@ MAX_DEPTH_RATIO = 5.0
 images near the horizon are stretched without bound. Chosen by hand; not measured."""
 
 MIN_WARP_SCALE, MIN_SHOWN_PX = 0.67, 16
-"""Images drawn at a scale below MIN_WARP_SCALE would alias, so they are blurred first, but not more
-than for a longer side of MIN_SHOWN_PX, because wider blurs take minutes."""
+"""An image drawn at a scale below MIN_WARP_SCALE is blurred first, against aliasing. The blur is at
+most that for a longer side of MIN_SHOWN_PX on the canvas, because wider blurs take minutes."""
 
 
 @dataclass(frozen=True, eq=False)

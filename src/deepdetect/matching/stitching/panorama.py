@@ -137,7 +137,7 @@ def stitch(
         images: two or more images in any order, in any form that `load_image` accepts. Paths are
             loaded one at a time, so that only one full-size image is in memory.
         detector: a `DeepDetect` or a `PointDetector`, or any object with a method `heatmap` or
-            `detect` like theirs. With heat maps, SIFT keypoints find overlaps and dense keypoints
+            `detect` like theirs. With heat maps, sparse keypoints find overlaps and dense keypoints
             confirm them; otherwise the points do both. Default `DeepDetect()`.
         channels: order of the colour channels in images that are arrays, as in `load_image`.
         projection: "plane" keeps lines straight; "cylindrical" and "spherical" need cameras that

@@ -52,18 +52,18 @@ MIN_OVERLAP = 0.1
 keypoints into the other image. Chosen by hand; not measured."""
 
 MAX_DISAGREEMENT_PX = 2.0
-"""A pair whose RMS distance from the joint fit exceeds this is tried again. Chosen by hand."""
+"""A pair is tried again if its RMS distance from the joint fit exceeds this. Chosen by hand."""
 
 MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MIN_STILL = 0.9
-"""If a homography that moves nothing explains less than this fraction of two images, only a menu or
-a caption stands still. Images taken with a still camera agree nearly everywhere."""
+"""If two images agree without any motion on less than this fraction of what both show, only a menu
+or a caption stands still. Images taken with a still camera agree nearly everywhere."""
 
 MIN_EXPLAINED = 0.3
-"""A homography must explain at least this fraction of what both images show in common. Wrong ones
-explain up to 0.12 (similar towers). Screens of which half stands still have 0.59."""
+"""Two images must agree, along a homography, on at least this fraction of what both show. Wrong
+homographies of similar towers reached 0.12; screenshots of which half stands still had 0.59."""
 
 MAX_RESIDUAL_PX = GUIDING_THRESHOLDS_PX["homography"]
 """Images contradict each other if the RMS residual of their joint fit exceeds the inlier threshold
