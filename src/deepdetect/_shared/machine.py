@@ -16,8 +16,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from functools import cache
+from contextlib import contextmanager, suppress
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -67,9 +66,6 @@ _max_threads: int | None = None
 
 _chosen = threading.local()
 """The attribute `threads` is the limit that `limited_threads` has set in the current thread."""
-
-_blas_lock, _blas_calls, _blas_limit = threading.Lock(), 0, ExitStack()
-"""The number of running calls of `one_blas_thread`, and the limit that the last one to end lifts."""
 
 TaskMap = Callable[..., Iterator[Any]]
 """Type of `map_in_processes`, and of functions that do the same on a cluster."""
@@ -224,25 +220,10 @@ def one_blas_thread() -> Iterator[None]:
 
     The matrices are small. More threads spend most of their time waiting for each other.
     """
-    global _blas_calls
-    with _blas_lock:
-        _blas_calls += 1
-        if _blas_calls == 1:
-            _blas_limit.enter_context(_blas().limit(limits=1, user_api="blas"))
-    try:
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, user_api="blas"):
         yield
-    finally:
-        with _blas_lock:
-            _blas_calls -= 1
-            if not _blas_calls:
-                _blas_limit.close()
-
-
-@cache
-def _blas() -> Any:
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController()
 
 
 def thread_limit() -> int | None:
