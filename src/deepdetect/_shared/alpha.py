@@ -40,14 +40,14 @@ def on_grey(
 
 
 def opaque_part(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the RGB of an image, and a (H, W) bool mask of its transparent pixels, or None."""
+    """Return an image's RGB, and the (H, W) bool mask of transparent pixels (None: all opaque)."""
     if pixels.shape[2] == 3:
         return pixels, None
     return np.ascontiguousarray(pixels[:, :, :3]), pixels[:, :, 3] == 0
 
 
 def continued(pixels: np.ndarray) -> np.ndarray:
-    """Fill transparent pixels with the nearest opaque colour, so that warps have no grey rim."""
+    """Fill transparent pixels with the nearest opaque colour; the grey would bleed into warps."""
     rgb, hidden = opaque_part(pixels)
     if hidden is None:
         return pixels

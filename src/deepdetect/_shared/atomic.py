@@ -20,7 +20,7 @@ from .errors import DeepDetectError
 
 ABANDONED_S, STEM_LENGTH = 24 * 3600.0, 40
 """Temporary files of other machines are removed after ABANDONED_S seconds. Temporary names contain
-up to STEM_LENGTH characters of the final name, because file systems limit the length of names."""
+up to STEM_LENGTH characters of the final name, since file systems limit names. Chosen by hand."""
 
 # The owner in a temporary name is a machine, a process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")

@@ -36,7 +36,7 @@ class WeightsError(DeepDetectError, ValueError):
 
 
 class ReconstructionError(DeepDetectError, ValueError):
-    """A reconstruction fails for the reason in the message; a `ValueError`."""
+    """A 3D reconstruction fails, for the reason in the message; a `ValueError`."""
 
 
 class NoDepthError(ReconstructionError):
@@ -170,5 +170,5 @@ for _error in (
     RegistrationError,
     WeightsError,
 ):
-    # Tracebacks and `pickle` then name the module from which users import the error.
+    # Tracebacks and `pickle` name this module, because users import the errors from it.
     _error.__module__ = "deepdetect"

@@ -62,9 +62,9 @@ def array_to_pixels(
     """Convert an array or PyTorch tensor to an (H, W, 3) RGB image, or (H, W, 4) as in `alpha`.
 
     The result is uint8 or, if `deep` is set and the input has more than 8 bits, uint16. `white` is
-    the value of white in an unsigned image, if known. `call` is the common value range of the
-    uint16 images of a call whose white is unknown. If `counts` is given, the histogram of such an
-    image is added to it. Messages call the image `name`. Other arguments are as in `load_image`.
+    the value of white in an unsigned image, if known. For uint16 images of unknown white, `call` is
+    the value range shared by all images of a call, and the image's histogram is added to `counts`
+    if given. Messages call the image `name`. Other arguments are as in `load_image`.
 
     Raises:
         ImageError: the image has an unsupported shape, type or range, or contains NaN.
@@ -89,7 +89,7 @@ def array_to_pixels(
     if array.shape[2] < 4:
         return rgb
     alpha = array[:, :, 3]
-    # In a deep image, the largest alpha counts as opaque, since 12-bit values end at 4095.
+    # If alpha has over 8 bits, its largest value counts as opaque: 12-bit values end at 4095.
     opaque = 255 if array.dtype == np.uint8 else alpha.max(initial=1)
     return on_grey(rgb, alpha, opaque, name)
 
@@ -102,7 +102,7 @@ def deep_values(image: Any) -> np.ndarray:
 
 
 def to_8_bits(rgb: np.ndarray, value_range: Sequence[float] = (0, 65535)) -> np.ndarray:
-    """Convert an image to uint8; `value_range` is black and white of a uint16 image."""
+    """Convert an image to uint8; `value_range` are the black and white of a uint16 image."""
     return rgb if rgb.dtype == np.uint8 else _in_range(rgb, value_range, "", False)
 
 

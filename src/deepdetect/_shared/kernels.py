@@ -55,7 +55,7 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
         ) from None
     if _announcement:
         _listen()
-    config: Any = numba.config  # type checkers do not know its settings
+    config: Any = numba.config  # type checkers do not know numba's settings
 
     def decorate(function: Callable[..., Any]) -> Any:
         with suppress(RuntimeError):  # numba found no writable cache folder

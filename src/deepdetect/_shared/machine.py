@@ -37,7 +37,7 @@ PARTS_PER_THREAD, TASKS_PER_WORKER = 4, 8
 TASKS_PER_WORKER tasks per worker, so that no thread or worker idles. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""If the work is interrupted or fails, running workers are killed after this many seconds."""
+"""Workers are killed this many seconds after the work fails or is interrupted. Chosen by hand."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that set the number of threads of libraries when they are loaded."""
@@ -45,7 +45,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 BYTES_PER = {
     # A keypoint's descriptor, and the keypoint's part of a matcher's search trees.
     "matched_keypoint": 1500,
-    # Blending a panorama: a pixel of its canvas, and one of the largest image warped onto it.
+    # Blending a panorama: a pixel of its canvas, and a pixel of the largest warped image.
     "canvas_pixel": 34,
     "blended_pixel": 30,
     # A pixel of a scale-space level: two float32 maps, and arrays derived from them.
@@ -54,7 +54,7 @@ BYTES_PER = {
     "dense_pixel": 250,
     "fused_pixel": 500,
 }
-"""Measured bytes of memory that each item needs; `needed_memory` multiplies them by counts."""
+"""Bytes of memory per item, as measured; `needed_memory` multiplies them by numbers of items."""
 
 # Options of glibc's `mallopt`: M_MMAP_MAX 0 maps no block on its own, M_TRIM_THRESHOLD -1 never
 # trims the heap, and M_TOP_PAD lets it grow in steps of 256 MB.
@@ -189,7 +189,7 @@ def _start_worker() -> None:
 
 
 def start_child() -> None:
-    """Let a new process use one thread, and end with its parent or by Ctrl-C."""
+    """Let this new process use one thread, and end with its parent or at Ctrl-C."""
     end_by_interrupt()
     use_one_thread()
     end_with_parent()
@@ -311,7 +311,7 @@ def require_memory(what: str, advice: str, **counts: float) -> None:
 def disable_malloc_trim() -> None:
     """Let this process keep the memory that it frees, if the C library is glibc.
 
-    By default, glibc returns large freed blocks to the system, which clears pages of new blocks.
+    By default, glibc returns large freed blocks to the system, and new blocks must be cleared.
     Clearing takes a fifth of the time of a training step on the CPU.
     """
     if platform.libc_ver()[0] == "glibc":
@@ -336,7 +336,7 @@ def _system_memory() -> int:
     with suppress(OSError, StopIteration):  # macOS lacks /proc/meminfo
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvail"))
-    with suppress(AttributeError, ValueError):  # Windows
+    with suppress(AttributeError, ValueError):  # Windows lacks `sysconf`
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
     return 4_000_000_000  # assumed if the system reports nothing
 

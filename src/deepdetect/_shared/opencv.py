@@ -53,7 +53,7 @@ def import_opencv() -> ModuleType:
             f"{LOWEST_VERSION} or later"
         ) from None
     version = getattr(found, "__version__", None)
-    if version is None:  # the removal of a package has left a folder `cv2` behind
+    if version is None:  # removing a package has left an incomplete folder `cv2`
         raise MissingExtraError(
             "the folder cv2 of the installed OpenCV is incomplete, perhaps because another package "
             "of OpenCV was removed: run pip install --force-reinstall opencv-python-headless"
@@ -73,7 +73,7 @@ def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
     """
     import_opencv()
     require_packages(purpose, "pycolmap", "h5py")
-    with sigterm_kept():  # pycolmap sets a handler that prints a stack trace
+    with sigterm_kept():  # pycolmap's import sets a handler that prints a stack trace
         import pycolmap
     return pycolmap
 
@@ -87,7 +87,7 @@ def is_lack_of_memory(error: Exception) -> bool:
 
 def installed_distributions() -> list[str]:
     """Return the installed packages that contain `cv2`."""
-    import importlib.metadata  # late, because it is slow to import
+    import importlib.metadata  # here, because its import is slow
 
     installed = {each.name for each in importlib.metadata.distributions()}
     return [name for name in DISTRIBUTIONS if name in installed]

@@ -57,7 +57,7 @@ def suggest_keywords(
 
 
 def shown(value: object) -> str:
-    """Return the text of a value for an error message, short and on one line."""
+    """Return a short text of a value, on one line, for an error message."""
     return " ".join(reprlib.repr(value).split())
 
 
@@ -71,7 +71,7 @@ ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     Callable: (Callable,),
     Mapping: (Mapping,),
 }
-"""Types of the values that are accepted, by the type in the annotation."""
+"""Types of the values that an argument may have, by the type in its annotation."""
 MADE_LATER = type(functools.cache(len))
 """Type of functions decorated with `functools.cache`. An argument may be such a function instead of
 an object, for example keypoints; the function makes the object at the first use."""

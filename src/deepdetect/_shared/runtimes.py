@@ -33,7 +33,7 @@ def import_openvino() -> ModuleType:
 def _import_with(
     package: str, entries: MutableMapping[str, Any], key: str, value: object
 ) -> ModuleType:
-    """Import a package while `entries[key]` has this value; then restore the entry.
+    """Import a package while `entries[key]` is `value`, and then restore the entry.
 
     ONNX Runtime and OpenVINO start telemetry when they are imported: they write an identifier into
     the home folder, and OpenVINO sends an event.
@@ -66,7 +66,7 @@ def start_session(
     # Waiting threads that spin start work sooner, but occupy processors long after a run.
     settings.add_session_config_entry("session.intra_op.allow_spinning", "0")
     settings.intra_op_num_threads = int(threads or thread_limit() or 0)
-    # A fallback to the CPU after a failure would print blocks of text.
+    # Falling back to the CPU after a failure, as by default, would print blocks of text.
     session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)
     session.disable_fallback()
     session._model_bytes = None  # frees the file's contents, kept for a fallback

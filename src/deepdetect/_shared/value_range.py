@@ -1,4 +1,4 @@
-"""Black and white of uint16 images that do not state them: one value range for each call."""
+"""Guesses which values mean black and white in uint16 images that do not state them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ SENSOR_BITS = (8, 10, 12, 14, 16)
 """Bit depths of sensors. The smallest that holds the values of a uint16 image is assumed."""
 
 LITTLE_RANGE = 1 / 8
-"""An image that uses less than this fraction of its range causes a warning, because few grey levels
-are left of it. Chosen by hand."""
+"""An image whose values span less than this fraction of its range causes a warning, because few
+grey levels are left when it is converted to 8 bits. Chosen by hand."""
 
 MAX_OUTLIERS, FEW = 1e-3, 1e-2
-"""The share MAX_OUTLIERS of the pixels may lie outside the range, because sensors have hot and dead
-pixels: up to one in a thousand. An image whose other pixels, without the share FEW at either end (a
-flame, the sun), use little of the range causes a warning. Chosen by hand."""
+"""The share MAX_OUTLIERS of the pixels may lie outside the range, as sensors have hot and dead
+pixels. To measure how much of its range an image uses, the share FEW of its pixels is left out at
+either end, because it may show a flame or the sun. Chosen by hand."""
 
 ValueRange = tuple[float, float]
 
@@ -25,7 +25,7 @@ ValueRange = tuple[float, float]
 def range_of_uint16(array: np.ndarray, name: str, call: ValueRange | None) -> ValueRange:
     """Return the values of black and white of a uint16 image that does not state them.
 
-    If a call has several images, these are the ends of their common range, which is `call`.
+    If one call reads several images, they share one range, which is given as `call`.
     """
     counts = counts_of(array)
     low, high = map(round, call or find_range(counts))
@@ -45,9 +45,9 @@ def counts_of(values: np.ndarray) -> np.ndarray:
 def find_range(counts: np.ndarray) -> ValueRange:
     """Find the values of black and white from the counts of all 65536 values.
 
-    White is the largest value of a depth in `SENSOR_BITS`. The share `MAX_OUTLIERS` of the pixels
-    may lie above it, and padding with 65535. Black is 0. But a narrow band of values that is
-    farther from 0 than it is wide is spread over the grey levels, at most one level per value.
+    White is the largest value of a bit depth in `SENSOR_BITS`. At most the share `MAX_OUTLIERS` of
+    the pixels is brighter, apart from padding with 65535. Black is 0, unless all values lie in a
+    narrow band farther from 0 than it is wide: then the range is that band, at least 255 wide.
     """
     levels = np.flatnonzero(counts)
     inner = levels[(levels > 0) & (levels < 65535)]  # 0 and 65535 may be padding
@@ -57,7 +57,7 @@ def find_range(counts: np.ndarray) -> ValueRange:
     shares = (MAX_OUTLIERS * total[-1], (1 - MAX_OUTLIERS) * total[-1])
     low, high = inner[np.searchsorted(total, shares)].tolist()
     white = _white_above(high)
-    if white < 256 and counts[65535] > shares[0]:  # a dark image with lamps
+    if white < 256 and counts[65535] > shares[0]:  # 65535: lamps in a dark image
         white = high = 65535
     width = high - low
     if not 0 < width < min(low, LITTLE_RANGE * white):
@@ -69,7 +69,7 @@ def find_range(counts: np.ndarray) -> ValueRange:
 
 def tell_if_little(values: np.ndarray, white: float, name: str) -> None:
     """Warn if an image uses a small fraction of its range from 0 to `white`."""
-    step = 1 + math.isqrt(values.size >> 16)  # a grid of some 65,536 values tells enough
+    step = 1 + math.isqrt(values.size >> 16)  # a grid of about 65,536 values, to save time
     seen = values[::step, ::step]
     seen = seen[(seen > 0) & (seen < white)]  # the ends may be padding
     if not len(seen):

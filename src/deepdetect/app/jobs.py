@@ -1,4 +1,4 @@
-"""Running the page's tasks: each has a process and a folder until the page asks for it no more."""
+"""Tasks of the page: each has a process and a folder, until the page stops asking for it."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Job:
     Attributes:
         name: secret name of the task, which only the page knows.
         state: what is sent to the page: the progress, the result or an error.
-        started, asked: times of the start, and of the page's last request for this task.
+        started, asked: `time.monotonic()` at the start, and at the page's last request for it.
     """
 
     def __init__(self, order: Order) -> None:
@@ -99,7 +99,7 @@ class Job:
         self._reason = reason
         if self.process.pid is not None:
             kill_group(self.process.pid)
-        self.process.kill()  # needed on Windows, and before the process has made its group
+        self.process.kill()  # Windows has no groups, and a new process has not made its own yet
         self._listener.join()
 
     def _listen(self) -> None:
@@ -112,7 +112,7 @@ class Job:
 
 
 class Jobs:
-    """All tasks of a server. Only the server's own thread starts tasks."""
+    """All tasks of a server. Only the server's own thread may start tasks."""
 
     def __init__(self, limits: AppOptions) -> None:
         self.limits = limits

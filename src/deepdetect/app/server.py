@@ -49,10 +49,10 @@ STATIC = Path(__file__).parent / "static"
 
 CLOSE = {"Connection": "close"}
 SHUTDOWN_S = 1
-"""The server waits this many seconds for running requests when it shuts down."""
+"""The server waits this many seconds for running requests at shutdown. Chosen by hand."""
 
 CHECK_EVERY_S = 1.0
-"""Interval in seconds at which the server ends tasks that take too long or are abandoned."""
+"""Seconds between two searches for tasks that take too long or are abandoned. Chosen by hand."""
 
 MAX_IMAGE_PIXELS = 2_100_000
 """Maximum number of pixels of an image that the page sends. The page scales images to two
@@ -60,12 +60,12 @@ megapixels, but then rounds their sides to multiples of 8, which may enlarge the
 
 POINT_BYTES = 12
 MAX_POINTS = 4000
-"""Maximum number of points that the page's slider allows. Each takes `POINT_BYTES`: x, y and a
-size in float32."""
+"""Maximum number of points in a request, as the page's slider allows. Each point takes
+`POINT_BYTES`: x, y and a size in float32."""
 
 MIN_SIDE = 16
 MAX_DESCRIPTION_BYTES = 1 << 18
-"""Maximum size of the JSON with a task's options and the names and sizes of its images."""
+"""Maximum bytes of the JSON with a task's options and the names and sizes of its images."""
 
 MAX_NAME_LENGTH = 200
 
@@ -157,7 +157,7 @@ class AppServer:
         self._server.should_exit = True
 
     def _routes(self) -> Starlette:
-        # Programs on Windows may have changed the type of .js files in the system's table.
+        # Another program may have changed the media type of .js files in Windows' registry.
         mimetypes.add_type("text/javascript", ".js")
         return Starlette(
             routes=[

@@ -157,7 +157,7 @@ def run_register(images: Images, options: Options, folder: Path, report: Report)
 
 
 def run_stitch(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
-    """Stitch the images to one panorama; list images that do not fit as left out."""
+    """Stitch the images to one panorama; the result lists the images that are left out."""
     stages = _stages(stages_of(len(images)), report)
     panorama = stitch([one.path for one in images], progress=stages)
     save_picture(panorama.image, folder / "panorama.jpg", value_range=panorama.value_range)

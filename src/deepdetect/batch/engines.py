@@ -30,14 +30,14 @@ from .._shared.machine import (
 )
 
 MAX_BLOCKS = 4096
-"""Tasks are divided into at most this many parts, because a part costs Ray some milliseconds."""
+"""Tasks make at most this many Ray blocks, each of which costs milliseconds. Chosen by hand."""
 
 PROCESSORS_PER_WORKER = 0.5
-"""Each worker reserves only this fraction of a processor in Ray, so that half of the machines can
-take over all workers. Otherwise tasks would wait forever for workers without a processor."""
+"""Each worker reserves only this fraction of a processor in Ray. If up to half of the machines are
+lost, the others can then take over their workers, and no task waits forever for a processor."""
 
 OBJECT_STORE_BYTES = 200_000_000
-"""Shared memory of a cluster that this module starts: little, because results go to files."""
+"""Shared memory of a cluster that this module starts. Little suffices: results go to files."""
 
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",

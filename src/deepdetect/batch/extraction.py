@@ -133,9 +133,9 @@ def extract_features(
 
 
 def noted_range(path: str | Path) -> ValueRange | None:
-    """Return the value range by which uint16 images were read for a features file, or None.
+    """Return the value range in which the uint16 images of a features file were read, or None.
 
-    Images that are added later are read by the same range.
+    Images that are added to the file later are read in the same range.
     """
     with suppress(DeepDetectError, ValueError, TypeError), open_hdf5(Path(path)) as file:
         low, high = json.loads(file.attrs[SETTINGS])["deep_range"]
@@ -165,7 +165,7 @@ def _extract(
                 keypoints = detector.describe(rgb, keypoints)
             else:
                 keypoints = describe_keypoints(gray, keypoints)
-            # The uncertainty is one pixel of the scaled image in which the keypoints were found.
+            # A position is uncertain by one pixel of the scaled image in which it was found.
             seen = seen_size(gray.shape, HeatmapOptions(detector.settings["resolution"]))
             uncertainty = max(gray.shape[1] / seen[0], gray.shape[0] / seen[1])
             column, row = np.rint(keypoints.xy).astype(np.int64).T

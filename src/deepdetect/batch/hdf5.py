@@ -41,20 +41,20 @@ SETTINGS = "deepdetect"
 """Name of the file attribute that stores, as JSON, the settings with which the file was made."""
 
 STATE = "source_state"
-"""Name of the group attribute that stores the state of the group's input."""
+"""Name of the group attribute that stores the `State` of the image or pair of the group."""
 
 FORMAT = ("v110", "v110")
 """Oldest and newest file format to write: HDF5 1.10 (2016), in which large groups are fast."""
 
 MIN_SHARDS, LARGEST_SHARD = 256, 32
-"""Many inputs make at least MIN_SHARDS shards, which keeps workers busy. A shard has at most
-LARGEST_SHARD inputs, because a killed worker loses its shard. Chosen by hand."""
+"""MIN_SHARDS or more inputs make at least MIN_SHARDS shards, to keep all workers busy. A shard has
+at most LARGEST_SHARD inputs, because a killed worker loses its shard. Chosen by hand."""
 
 State = tuple[int, ...]
-"""State of an input: whole numbers that change if the input changes, such as size and time."""
+"""Numbers that change if an image or pair changes, such as a file's size and time of change."""
 
 Item = tuple[Any, State]
-"""An input: its name and its state."""
+"""An input, which is an image or a pair of images: its name (or pair of names) and its state."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Group:
 
 
 MakeGroups = Callable[[Sequence[Item], dict[Any, int], list[str]], Iterator[Group]]
-"""Function that yields the groups made from inputs. For each input, the function adds a count to
-its second argument or a failure to its third argument."""
+"""Function that yields the groups made from inputs. For each input, the function adds the number of
+keypoints or matches to its second argument, or a sentence on the failure to its third."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +77,11 @@ class BatchReport:
     """Outcome of an extraction of features, or of a matching of pairs.
 
     Attributes:
-        path: the file.
+        path: the HDF5 file.
         counts: number of keypoints of each image, or of matches of each pair, in this run.
         skipped: number of images or pairs that an earlier run had processed.
         failures: a sentence on each image or pair that could not be processed.
-        of: "images" or "pairs".
+        of: what was processed, "images" or "pairs".
     """
 
     path: Path

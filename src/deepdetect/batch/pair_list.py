@@ -60,13 +60,13 @@ SIMILAR = 20
 
 
 def similar(pairs: object) -> int | None:
-    """Return N of "similar:N", `SIMILAR` for "similar", or None for another choice of pairs."""
+    """Return N if `pairs` is "similar:N", `SIMILAR` if it is "similar", and None otherwise."""
     match = isinstance(pairs, str) and re.fullmatch("similar(?::([1-9][0-9]{0,8}))?", pairs)
     return int(match[1] or SIMILAR) if match else None
 
 
 def following(pairs: object) -> int | None:
-    """Return N of "sequential:N", a huge N for "exhaustive", or None for another choice."""
+    """Return N if `pairs` is "sequential:N", a huge number if "exhaustive", and None otherwise."""
     match = isinstance(pairs, str) and re.fullmatch("sequential:([1-9][0-9]{0,8})", pairs)
     return sys.maxsize if pairs == "exhaustive" else int(match[1]) if match else None
 

@@ -207,7 +207,7 @@ def _find_pairs(
 
 
 def _state(file: Any, name: str) -> State | None:
-    """Return numbers that change if an image's features change, or None if there are none."""
+    """Return numbers that change if an image's features change, or None if it has no features."""
     try:
         group = file[name]
         if state := state_of(group):
@@ -227,7 +227,7 @@ def _match_pairs(
     options: PairMatchingOptions,
 ) -> Iterator[Group]:
     with open_hdf5(features) as file:
-        first: tuple[str, Keypoints] | None = None  # kept: pairs are sorted by their first image
+        first: tuple[str, Keypoints] | None = None  # reused: pairs are sorted by first image
         for (name0, name1), state in pairs:
             with noted_failures(f"{name0} {name1}", failures):
                 if first is None or first[0] != name0:

@@ -29,10 +29,10 @@ WORDS, DESCRIPTORS_OF_WORD = 64, 8
 training descriptors on average. Chosen by hand."""
 
 TRAINING_IMAGES, TRAINING_DESCRIPTORS, KMEANS_ITERATIONS = 500, 50_000, 10
-"""Maximum number of images, descriptors and k-means iterations for the vocabulary, to save time."""
+"""Limits of training images, descriptors and k-means iterations, to save time. Chosen by hand."""
 
 COMPARED_ROWS = 256
-"""This many images are compared at once with all others, which takes 300 MB for 100,000 images."""
+"""Number of images compared at once with all others: 300 MB of memory for 100,000 images."""
 
 
 def similar_pairs(
@@ -80,7 +80,7 @@ def vlad_vectors(
     seed: int = 0,
     done: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Describe each image by a VLAD vector, in which each word's sum of residuals has unit length.
+    """Describe each image by a VLAD vector, after scaling each word's residual sum to unit length.
 
     `descriptors(i)` returns the descriptors of image i, (N_i, D) float32 of unit length. Returns
     (M, words * D) vectors of unit length, and the (M,) indices of the images. Images without

@@ -28,10 +28,10 @@ from ._app import MORE
 from ._app import NOTHING_FOUND as NOTHING_FOUND
 
 CELL_WIDTH = 18
-"""A cell of a table has at least this many characters. Chosen by hand."""
+"""Minimum width of a cell of a printed table, in characters. Chosen by hand."""
 
 TEXT_WIDTH = 100
-"""A line of a wrapped table has at most this many characters, unless a word is longer."""
+"""Maximum length of a line of a wrapped table, in characters; longer words exceed it."""
 
 
 @dataclass(frozen=True)

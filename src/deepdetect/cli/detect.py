@@ -140,7 +140,7 @@ class _Work:
     def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any]:
         shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
         outputs = Outputs([*files.values()], [path], overwrite=self.overwrite)
-        done = outputs.find()  # another command may have finished the image meanwhile
+        done = outputs.find()  # another process may have finished the image meanwhile
         if done is not None and done["settings"] == self.settings:
             return {"image": path, **done["numbers"], **shown, "skipped": True}
         earlier = None if self.overwrite else Outputs([files["file"]], [path]).find()
@@ -173,7 +173,7 @@ class _Work:
             noted |= {"numbers": numbers, "settings": self.settings, "files": written}
         for name in (earlier or {}).get("files", ()):
             old = files["file"].with_name(name)
-            with contextlib.suppress(OptionError):  # keeps a file that was changed since
+            with contextlib.suppress(OptionError):  # keeps a file that a user has changed
                 if old not in outputs.paths and Outputs([old], [path]).find():
                     old.unlink()
         return {"image": path, **numbers, **shown, "skipped": False}

@@ -24,13 +24,13 @@ PURPOSES = {
     "sfm": "reconstruct with three or more images, extract, match-many, export, georeferences",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
-"""Probabilities of two back ends may differ by this much: five times the usual difference."""
+"""Probabilities of two back ends may differ by this much: five times the usual 0.001."""
 TIMED_ROUNDS = 5
-"""The benchmark times this many runs, after a first one that compiles. Chosen by hand."""
+"""The benchmark times this many runs, after one that compiles functions. Chosen by hand."""
 NEAR_SHIFT_PX = 16
 """Disparity in pixels of the foreground in the second pair of the self-test. Chosen by hand."""
 MIN_PRECISION = 0.95
-"""The self-test fails below this fraction of correct matches; 1 is usual. Chosen by hand."""
+"""The self-test fails below this fraction of matches correct to 1 px, usually 1. Chosen by hand."""
 
 
 class Finding(NamedTuple):
@@ -85,7 +85,7 @@ def packages() -> Iterator[Finding]:
     for text in importlib.metadata.requires("deepdetect") or []:
         requirement, _, marker = text.partition(";")
         name, lowest = re.findall(r"^[\w.-]+|(?<=>=)[\d.]+", requirement + " >=0")[:2]
-        if name == "deepdetect" or name.startswith("opencv"):  # any package of OpenCV works
+        if name == "deepdetect" or name.startswith("opencv"):  # the check `opencv` covers OpenCV
             continue
         extra = re.sub(r"\W|extra", "", marker)
         absent = lacking.setdefault(extra, [])
@@ -160,7 +160,7 @@ def self_test() -> Iterator[Finding]:
         column, row = np.rint(matches.points0).astype(int).T
         expected = np.array(shift) + near[row, column, :1] * np.array(off)
         errors.append(np.hypot(*(matches.points0 - matches.points1 - expected).T))
-    disparity_map(first, third)  # compiles its functions for other commands
+    disparity_map(first, third)  # compiles and caches its functions for other commands
     wrong = np.concatenate(errors) >= 1
     precision, count = 1 - wrong.mean(), min(map(len, errors))
     value = f"{len(points)} points, {len(wrong):,} matches, {precision:.1%} of them correct"

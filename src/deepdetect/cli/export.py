@@ -144,7 +144,7 @@ def hloc(
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
-    """Return `folder / marker`; raise an error if the folder has files, but not this one."""
+    """Return `folder / marker`; raise an OptionError if the folder has only other files."""
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")

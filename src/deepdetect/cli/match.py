@@ -231,7 +231,7 @@ def _choose_pairs(
 
 
 def _why_none(matches: Matches, unguided: bool) -> str | None:
-    """Return a sentence that says why there are no matches, or no geometry."""
+    """Return a sentence that says why there are no matches or no geometry; None if there are."""
     if not len(matches) and (matches.success or unguided):
         return "there are no matches: the images have too little texture, or the options allow none"
     if matches.success:
@@ -329,9 +329,9 @@ def register(
             if files[path].suffix == ".tif":
                 kept.write_tiff(bands, made[path])
             else:
-                every = (0, 65535) if bands.dtype == np.uint16 else None  # keeps their numbers
+                every = (0, 65535) if bands.dtype == np.uint16 else None  # keeps uint16 values
                 rgb = array_to_rgb(bands[:, :, :3], value_range=every, deep=True)
-                rgb[(bands[:, :, 3:] == 0).any(axis=2)] = 0  # transparent
+                rgb[(bands[:, :, 3:] == 0).any(axis=2)] = 0  # blackens transparent pixels
                 rgb = found.warped if path == image1 else rgb
                 save_picture(rgb, made[path], kept)
             kept.write_beside(files[path])

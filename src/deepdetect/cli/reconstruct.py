@@ -51,7 +51,7 @@ MANY = cli.From(
     types={"control_points": Path | None},
 )
 WORKERS = cli.From(reconstruct_many, more="workers")
-"""These options, like those of `MANY`, are only for more than two images."""
+"""Options that, like those of `MANY`, only a reconstruction from more than two images accepts."""
 
 CHOSEN = replace(
     SELECTION,

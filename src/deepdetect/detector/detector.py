@@ -62,8 +62,8 @@ AnyDetector = Detector | HeatmapDetector
 class DeepDetect:
     """The dense keypoint detector of the paper.
 
-    Its keypoints are the pixels to which the network gives a high probability. If you need only a
-    few thousand keypoints, use `PointDetector`: its keypoints work better than as many pixels.
+    Its keypoints are pixels to which the network gives a high probability. A few thousand keypoints
+    of `PointDetector` give more correct matches than as many pixels: use that if you need few.
 
     Args:
         weights: name of bundled weights ("default", "dense", "free" or "espnet"), or an ONNX file.

@@ -22,14 +22,14 @@ from .pretrained import STRIDE
 from .tiling import BYTES_PER_PIXEL, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
-"""The resolution "auto" scales larger images down to this area: finer pixels mostly show noise."""
+"""Pixels to which the resolution "auto" scales larger images: finer detail is mostly noise."""
 
 RELEASE_PIXELS = 20_000_000
 """If an image with more pixels than this was scaled down for the network, the memory that the
-network keeps is released before the maps are enlarged."""
+network keeps is released before the maps are enlarged. Chosen by hand."""
 
 MIN_TILE_MEGAPIXELS = 1.5
-"""Minimum size of a tile: smaller tiles would consist mostly of overlap."""
+"""Minimum size of a tile in megapixels, chosen by hand: smaller tiles overlap relatively more."""
 
 Run = Callable[[np.ndarray], np.ndarray]
 """A function that maps an image, (H, W, 3) uint8, to its (H, W) logits."""

@@ -40,7 +40,7 @@ class PointDetector:
 
     Keypoints are maxima of |det Hessian|. A small trained network, not that of `DeepDetect`, ranks
     them by how likely they are to be found again in another image. A few thousand of these
-    keypoints work better than as many pixels of `DeepDetect`'s heat map.
+    keypoints give more correct matches than as many pixels of `DeepDetect`'s heat map.
 
     Args:
         max_keypoints: maximum number of keypoints per image. None: all.
@@ -260,7 +260,7 @@ class PointDetector:
         gray = self._scaled(gray)
         size = gray.shape[::-1]
         if size != whole and ignore is not None:
-            # A pixel of the scaled image is ignored if it or a neighbour covers an ignored pixel.
+            # A scaled pixel is ignored if it or one of its 8 neighbours covers an ignored pixel.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
         with memory_named(gray.shape), limited_threads(self.threads):

@@ -13,7 +13,7 @@ RANKER = Path(__file__).parent / "points" / "ranker.npz"
 """Weights of the network that ranks keypoints. MODEL_CARD.md in the same folder describes them."""
 
 POINTS_GRAPH = RANKER.with_name("points.onnx")
-"""ONNX graph of the whole `PointDetector`, which exported ONNX files can include."""
+"""ONNX graph of `PointDetector` without descriptors, which exported ONNX files can include."""
 
 PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
@@ -33,7 +33,7 @@ LOGITS = "logits"
 """Name of the ONNX output that holds logits; an output of another name holds probabilities."""
 
 POINTS = "keypoints", "scores", "sizes", "angles"
-"""Names of outputs of ONNX files that include a `PointDetector`. Only other programs read them."""
+"""ONNX outputs of files that include `POINTS_GRAPH`. Only other programs read these outputs."""
 
 
 def pretrained_weights(name: str = "default") -> Path:

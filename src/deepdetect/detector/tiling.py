@@ -41,12 +41,12 @@ THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
 """The constants from `COUNTED` to `THRESHOLDS` name the tensors at which the network is cut."""
 
 SCALES, MARGIN = (4, 2, 1), 4
-"""The three feature maps have SCALES rows and columns per stride of 8 px. Each tile has a border of
-MARGIN strides, because convolutions need pixels up to 28 px away."""
+"""The three feature maps have SCALES rows and columns per stride of 8 px. A tile is read with a
+border of MARGIN strides, because convolutions need pixels up to 28 px away."""
 
 BYTES_PER_PIXEL, DEFAULT_TILE_MEGAPIXELS = 90, 2.7
 """A run without tiles takes about BYTES_PER_PIXEL bytes of memory per pixel in ONNX Runtime or
-OpenVINO. DEFAULT_TILE_MEGAPIXELS is the usual size of a tile."""
+OpenVINO. DEFAULT_TILE_MEGAPIXELS is the default size of a tile, chosen by hand."""
 
 Part = Callable[..., list[np.ndarray]]
 
@@ -132,7 +132,7 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
             part((COUNTED, *AVERAGES, *MAXIMA), (THRESHOLDS,)),
             part(("image", *LIGHT, THRESHOLDS), (LOGITS,)),
         )
-    except Exception:  # a tensor is missing, or depends on further inputs
+    except Exception:  # another network: a tensor is missing, or depends on further inputs
         return None
 
 
@@ -166,7 +166,7 @@ def _times(span: slice, scale: int) -> slice:
 
 
 def _planes(rgb: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-    """Return a tile as (1, 3, H, W) float32, without padding."""
+    """Return the tile of these rows and columns, in strides, as (1, 3, H, W) float32 in [0, 1]."""
     tile = rgb[_times(rows, STRIDE), _times(columns, STRIDE)]
     planes = np.empty((1, 3, *tile.shape[:2]), np.float32)
     fill_planes(tile, planes[0])

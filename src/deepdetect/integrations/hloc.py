@@ -136,7 +136,7 @@ class DeepDetectMatcher(BaseModel):
             count, oris = len(descriptors), data.get(f"oris{side}")
             features.append(
                 Keypoints(
-                    np.zeros((count, 2)),  # the matcher does not use positions
+                    np.zeros((count, 2)),  # positions, which this matcher does not use
                     np.ones(count),
                     (1, 1),
                     angles=None if oris is None else oris[0, :count].cpu().float().numpy() % 360,

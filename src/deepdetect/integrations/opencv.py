@@ -135,7 +135,7 @@ def _ignored(mask: np.ndarray | None) -> np.ndarray | None:
 
 
 def _to_opencv(points: Keypoints) -> tuple[cv2.KeyPoint, ...]:
-    """Convert keypoints to OpenCV's, with the octaves at which `cv2.SIFT` describes them."""
+    """Convert keypoints to `cv2.KeyPoint`, with the octaves at which `cv2.SIFT` describes them."""
     assert points.sizes is not None
     octaves = packed_octaves(points.sizes, points.image_size)
     return tuple(dataclasses.replace(points, octaves=octaves).to_opencv())

@@ -26,7 +26,7 @@ def load_tensor(image: Any) -> np.ndarray:
 
 
 def padded(rows: Sequence[Any], device: torch.device) -> torch.Tensor:
-    """Stack arrays or tensors of different lengths into one tensor; pad the ends with zeros."""
+    """Stack B arrays or tensors (N_i, ...) into one tensor (B, max N_i, ...), padded with zeros."""
     import torch
 
     tensors = [torch.as_tensor(values) for values in rows]

@@ -1,4 +1,4 @@
-"""Files of COLMAP: a database, or text files. `sfm.colmap` describes coordinates and units."""
+"""Writing of COLMAP's files: a database, or text files (coordinates and units: `sfm.colmap`)."""
 
 from __future__ import annotations
 

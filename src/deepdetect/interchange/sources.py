@@ -22,7 +22,7 @@ from ..io.tables import load_keypoints, load_matches
 from .collection import Collection, PairMatches
 
 MAX_ALL_PAIRS = 50
-"""If no pairs are given, all pairs of at most this number of images are matched. Chosen by hand."""
+"""`match_folder` without `pairs` matches all pairs of up to this many images. Chosen by hand."""
 
 MATCHES_SUFFIX = "_matches"
 """The names of NPZ files written by `deepdetect match` end with this, before the suffix .npz."""
@@ -181,7 +181,7 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
 
 
 def _name_of(path: Path, names: Mapping[str, str]) -> str:
-    """Return the image name for the longest trailing part of an npz file's path in `names`."""
+    """Return the name in `names` whose key is the longest trailing part of an npz file's path."""
     parts = path.with_suffix("").parts
     for first in range(len(parts)):
         if (key := "/".join(parts[first:])) in names:
@@ -253,7 +253,7 @@ def match_folder(
             extracted.check()
         keypoints = read_features_file(features)
         unread = set(names) - keypoints.keys()
-        # An unreadable image counts as one failure; the pairs with it are not counted.
+        # An unreadable image counts as one failure; its pairs do not count as further failures.
         wanted = list_pairs(pairs, [name for name in names if name in keypoints])
         wanted = [pair for pair in wanted if unread.isdisjoint(pair)]
         matched = match_pairs(features, wanted, found, workers=workers, quiet=quiet)

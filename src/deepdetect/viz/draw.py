@@ -1,4 +1,4 @@
-"""Visualisations of keypoints, matches, heat maps and depth maps, drawn from arrays."""
+"""Pictures of keypoints, matches, heat maps and depth maps, drawn from arrays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_CIRCLES, LEAST_RADIUS_PX = 5000, 2.0
 A circle has at least the radius LEAST_RADIUS_PX, or 1 pixel more if its keypoint has no size."""
 
 PICTURE_SIDE_PX = 2000
-"""Longest side of a visualisation, in pixels. A JPEG of it then takes less than two megabytes."""
+"""Longest side of a visualisation, in pixels, so that its JPEG takes less than two megabytes."""
 
 READABLE_WIDTH_PX = 800
 """Captions, lines and points grow with the width of images wider than this. Chosen by hand."""
@@ -24,7 +24,7 @@ LINES, DOTS = 60, 1500
 `LINES` of the pairs are joined by a line. Chosen by hand."""
 
 SHOWN_PERCENTILE = 99.0
-"""Colour scales span the 1st to this percentile of the values, so that outliers do not matter."""
+"""Colour scales span the 1st to this percentile, so that outliers do not matter. Chosen by hand."""
 
 LEAST_DEPTH_LEVEL = 0.2
 """The farthest depth has this level (0 to 1) of the colour scale, because darker colours look like
@@ -112,7 +112,7 @@ def _colors_of_positions(positions: np.ndarray) -> np.ndarray:
 def draw_circle(
     canvas: np.ndarray, centre: np.ndarray, radius: float, color: Sequence[int], width: int
 ) -> None:
-    """Draw a circle with sub-pixel centre and radius."""
+    """Draw a circle; its centre (x, y) and radius, in pixels, are rounded to sixteenths."""
     x, y = np.rint(centre * 16).astype(int).tolist()
     cv2.circle(canvas, (x, y), round(radius * 16), tuple(color), width, cv2.LINE_AA, 4)
 
@@ -126,8 +126,8 @@ def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
 def draw_logits(logits: np.ndarray) -> np.ndarray:
     """Colour an (H, W) map of logits, with a colour scale below it.
 
-    A logit of 0 is a probability of 0.5. A map of probabilities would saturate, because float32
-    rounds the probability of a sixth of the pixels of a photograph to 1.
+    A logit of 0 is a probability of 0.5. A map of probabilities would saturate: in a photograph,
+    float32 rounds the probabilities of about a sixth of the pixels to 1.
     """
     shown = fit_picture(np.asarray(logits, np.float32))
     known = np.where(np.isfinite(shown), shown, 0)

@@ -1,6 +1,6 @@
 """Cutting out the part of a network in an ONNX file that lies between named tensors.
 
-This needs only Protobuf, not the package `onnx`. Protobuf copies undeclared fields unchanged.
+The code needs Protobuf, but not the package `onnx`. Protobuf copies undeclared fields unchanged.
 """
 
 from __future__ import annotations

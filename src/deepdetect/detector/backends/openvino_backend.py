@@ -1,4 +1,4 @@
-"""The backend OpenVINO, an optional package that is 1.5 times as fast as ONNX Runtime on CPUs."""
+"""The backend OpenVINO, an optional package, which alone can run the network in bfloat16."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ..pretrained import LOGITS, PADDED_IMAGE, POINTS
 from .interface import RuntimeOptions, as_logits, failed_run, output_to_read, unreadable
 
 COMPILED_LAYERS = 100
-"""OpenVINO compiles layers for each image size, and caches at most this many. Its default, 5000,
-would fill 0.5 GB if image sizes vary."""
+"""OpenVINO compiles layers for each image size, and caches at most this many. OpenVINO's default of
+5000 would fill 0.5 GB if image sizes vary. Chosen by hand."""
 
 
 _CORES: list[Any] = []
@@ -52,7 +52,7 @@ class OpenVinoNetwork:
                 model = self._model = self._compile()
             request = model.create_infer_request()  # one per call, for concurrent threads
             output = request.infer([image], share_inputs=True)[self._output_name]
-            # If memory is short, OpenVINO may also return nothing, or the previous image's map.
+            # If memory is short, OpenVINO may return an empty map or that of the previous image.
             if self._works and output.shape[2:] != image.shape[2:]:
                 raise MemoryError("OpenVINO gave a map of another size than the image")
         except Exception as error:  # OpenVINO's exceptions share no base class
@@ -65,7 +65,7 @@ class OpenVinoNetwork:
 
     def release_memory(self) -> None:
         """Release the memory that the model keeps between runs."""
-        # The method fails while another thread runs the model. Versions before 2025 lack it.
+        # `release_memory` fails while another thread runs the model; before 2025 it was missing.
         with contextlib.suppress(Exception):
             self._model.release_memory()
 
@@ -114,4 +114,4 @@ def _keep_what_is_read(graph: Any) -> None:
     for node in graph.get_ordered_ops():
         for value in node.outputs():
             if PADDED_IMAGE in value.get_names():
-                value.replace(graph.input(0))  # avoids a copy with 12 bytes per pixel
+                value.replace(graph.input(0))  # avoids a copy of 12 bytes per pixel

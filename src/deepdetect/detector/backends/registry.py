@@ -65,8 +65,8 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
     """Load and check a file, unless it is cached with the same `state` (path, time, size)."""
     network = BACKENDS[backend](path, options)
-    # A run on a small image of noise rejects unsuitable weights. These numbers are random enough:
-    # importing NumPy's random generators would take 6 MB.
+    # A run on a small image of noise rejects unsuitable weights. Multiples of 40503 modulo 2**16
+    # serve as noise, because importing NumPy's random generators would take 6 MB.
     numbers = np.arange(3 * math.prod(PROBE_SHAPE), dtype=np.uint16) * np.uint16(40503)
     noise = numbers.reshape(1, 3, *PROBE_SHAPE).astype(np.float32) * np.float32(2**-16)
     try:

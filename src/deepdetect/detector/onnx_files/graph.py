@@ -19,7 +19,7 @@ file pad, crop and compute probabilities."""
 
 _OUTSIDE = {"shape", "sides", "minus_sides", "missing", "padding", PADDED_IMAGE}
 _OUTSIDE |= {"sigmoid", PROBABILITY, LOGITS}
-"""Names of the tensors that padding, cropping and the sigmoid compute, outside the network."""
+"""Names of the tensors that the nodes for padding, cropping and the sigmoid compute."""
 
 METADATA = {
     "channels": "RGB",

@@ -17,8 +17,8 @@ each ring, at equal angles. Chosen by hand."""
 
 FEATURES = 23 + 8 * len(RING_RADII)
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
-"""The three floors are added to |det Hessian|, to squared gradients, and to the strengths by which
-features are divided, so that noise and rounding have little effect on logarithms and quotients."""
+"""The first two floors are added to |det Hessian| and to squared gradients before logarithms, the
+third to |det Hessian| before its root divides features: all damp noise. Chosen by hand."""
 
 
 def ring_offsets() -> np.ndarray:

@@ -49,10 +49,10 @@ def describe_learned(
     """Return keypoints with learned descriptors at their own sizes and angles.
 
     `gray` is the (H, W) uint8 luma of the image, possibly scaled down. Angles that are missing or
-    -1 are replaced by the dominant gradient orientations. For "cross-modal", `edge_strength`
-    replaces the luma, and all angles are replaced by its dominant orientations. `descriptor` is a
-    name in `DESCRIPTOR_GRAPHS`, or a similar ONNX file. Keypoints without sizes raise an
-    OptionError.
+    -1 are replaced by the dominant gradient orientations. For "cross-modal", the luma is replaced
+    by its `edge_strength`, and all angles by the dominant orientations of that map. `descriptor` is
+    a name in `DESCRIPTOR_GRAPHS`, or an ONNX file with the same inputs and outputs. Keypoints
+    without sizes raise an OptionError.
     """
     kind = descriptor_type(descriptor)
     if not len(keypoints):

@@ -67,8 +67,8 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     from .kernels import differentiate
 
     smooth, determinant = (np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(2))
-    # Subtracting the mean brings values close to 0, where float32 rounds least. So other
-    # implementations, such as the ONNX graph, find the same maxima.
+    # Subtracting the mean brings values close to 0, where float32 rounds least. With less rounding,
+    # other implementations, such as the ONNX graph, find the same maxima.
     mean = np.float32(np.rint(gray.mean()))
     space = ScaleSpace(mean / np.float32(255), smooth, determinant)
     current, reached = (gray - mean) / np.float32(255), 0.0

@@ -44,7 +44,7 @@ def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def
 
 @compiled(nogil=True, error_model="numpy")
 def _arctangents(values):  # type: ignore[no-untyped-def]
-    """Replace float32 numbers by their arctangents, by Cephes's formula in a vectorised loop."""
+    """Replace float32 numbers by their arctangents, by Cephes's series, which vectorises."""
     for k in range(len(values)):
         x = abs(values[k])
         steep, medium = x > np.float32(2.41421356), x > np.float32(0.41421356)
@@ -77,8 +77,8 @@ def measure_candidates(  # type: ignore[no-untyped-def]
     steps, values = np.empty((3, _POINTS), np.int64), np.empty((3, _POINTS), np.float32)
     places, right, down = steps[0], steps[1], steps[2]
     response, slope, light = values[0], values[1], values[2]
-    # `logs` holds |det Hessian| at the candidate and at three neighbouring scales, the maxima of
-    # |det Hessian| nearby at these three scales, squared gradients at all four, and ring values.
+    # `logs`: |det Hessian| at the candidate's scale and three others, maxima near the candidate at
+    # those three, squared gradients at all four, and ring values. `bent`: inputs of arctangents.
     logs, bent = np.empty(11 + 7 * RINGS, np.float32), np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
         level, row, column = candidates[n, 0], candidates[n, 1], candidates[n, 2]
@@ -136,7 +136,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
             bent[4 + k] = total / np.float32(RING_POINTS) / strength * half
             bent[4 + RINGS + k] = brightest / strength * half
             bent[4 + 2 * RINGS + k] = darkest / strength * half
-        # One logarithm of a product replaces four. The product is at least 1e-28, never 0.
+        # One logarithm of the product of 4 values replaces 4; the product is at least 1e-28, not 0.
         for k in range(2 * RINGS):
             product, slopes = np.float32(1), np.float32(1)
             for j in range(k, _POINTS, 2 * RINGS):

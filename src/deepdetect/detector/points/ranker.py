@@ -14,7 +14,7 @@ from .candidate_features import FEATURES
 
 MAX_DEVIATIONS, CHUNK = 6.0, 2048
 """Features are clipped at MAX_DEVIATIONS standard deviations from their mean. CHUNK candidates are
-ranked at a time, so that their features stay in the processor's cache."""
+ranked at a time, so that their features stay in the processor's cache. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +22,8 @@ class Ranker:
     """Weights of the ranker, a multilayer perceptron on the features of candidates.
 
     The logit of a candidate is its first feature plus the output of the perceptron, whose input is
-    normalised by `mean` and `deviation`. Each of the `layers` has weights (outputs, inputs) and
-    biases, with ReLU between the layers.
+    normalised by the (F,) `mean` and `deviation` of the features. Each of the `layers` has weights
+    (outputs, inputs) and biases (outputs,), with ReLU between the layers.
     """
 
     mean: np.ndarray
