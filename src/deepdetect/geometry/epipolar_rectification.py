@@ -121,8 +121,8 @@ class PolarFrame:
     def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
         """Warp a view into the frame; return the image and the (H, W) bool mask of valid pixels."""
         width, height = self.size
-        places = self._positions(np.arange(width)[None], np.arange(height)[:, None], view)
-        places = places.astype(np.float32)
+        column, row = np.arange(width, dtype=np.float32)[None], np.arange(height)[:, None]
+        places = self._positions(column, row, view)
         last = np.array(image.shape[1::-1], np.float32) - 0.5
         shown = np.all((places >= -0.5) & (places <= last), axis=2)
         border = cv2.BORDER_REPLICATE
@@ -131,12 +131,16 @@ class PolarFrame:
     def _positions(self, column: np.ndarray, row: np.ndarray, view: int) -> np.ndarray:
         """Map columns and rows of the frame, broadcast together, to (..., 2) view positions."""
         angles = self.middle + self.first_angle + row * self.step
-        directions = self._directions(angles.ravel(), view).reshape(*row.shape, 2)
+        origin, along = self.epipoles[view], self._directions(angles.ravel(), view)
+        matrix = np.eye(3) if not view or self.plane is None else self.plane
         radius = self.min_radius_px * np.exp(column * self.step)
-        positions = self.epipoles[view] + directions * radius[..., None]
-        if view and self.plane is not None:
-            return transform_points(positions, self.plane).reshape(positions.shape)
-        return positions
+        # A homography maps e + r d, r times the direction d from the epipole e, to He + r Hd.
+        starts, slopes = matrix @ (*origin, 1.0), (along @ matrix[:, :2].T).astype(radius.dtype)
+        x, y, z = (
+            start + slope.reshape(row.shape) * radius
+            for start, slope in zip(starts.tolist(), slopes.T, strict=True)
+        )
+        return np.stack([x / z, y / z], axis=-1)
 
     def _directions(self, angles: np.ndarray, view: int) -> np.ndarray:
         first = np.column_stack([np.cos(angles), np.sin(angles)])

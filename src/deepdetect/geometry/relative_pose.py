@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from .._shared.opencv import cv2
 from .camera import Calibration, fundamental_matrix
 from .estimation import GeometryOptions, estimate_geometry
-from .transforms import epipolar_errors, signed_epipolar_errors
+from .transforms import epipolar_errors, epipolar_slopes, signed_epipolar_errors
 
 Pose = tuple[np.ndarray, np.ndarray]
 """A rotation (3, 3) and a translation (3,). They map a point X0 in the frame of the first camera to
 X1 = rotation @ X0 + translation in the frame of the second."""
 
+T = TypeVar("T")
+
 BLOCK, MAX_MATCHES = 100_000, 50_000
 """`triangulate` processes at most BLOCK matches at once, because it needs much memory. A pose is
 fitted to at most MAX_MATCHES, because more do not improve it."""
 
-MAX_ITERATIONS, DERIVATIVE_STEP, MIN_CHANGE = 10, 1e-6, 1e-9
-"""Gauss-Newton stops after MAX_ITERATIONS steps, or when no angle changes by more than MIN_CHANGE.
-Numerical derivatives vary each of the five angles by DERIVATIVE_STEP. Both are in radians."""
+MAX_ITERATIONS, DERIVATIVE_STEP, MIN_GAIN = 20, 1e-6, 1e-7
+"""Levenberg-Marquardt stops after MAX_ITERATIONS steps, or when the loss falls by less than this
+fraction. Numerical derivatives of the matrix vary each parameter by DERIVATIVE_STEP. Chosen by
+hand."""
 
 MAX_REFITS, MIN_INLIER_GAIN = 4, 0.01
 """A pose is refitted to its inliers at most MAX_REFITS times, while their number grows by more than
@@ -196,37 +201,73 @@ def refine_pose(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine a pose by the Sampson distances of (M, 2) matches, most of them correct.
 
-    Gauss-Newton minimises a Cauchy loss over five angles: three of the rotation and two of the
-    direction of the translation. The loss of the result is never higher than that of the initial
-    pose. A match with a Sampson distance of `scale_px` / 2 has half the weight of an exact match.
+    A Cauchy loss is minimised over five angles: three of the rotation and two of the direction of
+    the translation. It is never higher than that of the initial pose. A match with a Sampson
+    distance of `scale_px` / 2 has half the weight of an exact match.
     """
     points0, points1 = _evenly(points0), _evenly(points1)
-
-    def residuals(pose: Pose) -> np.ndarray:
-        return signed_epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
-
-    def cost(values: np.ndarray) -> float:
-        return float(np.log1p((values / (scale_px / 2)) ** 2).sum())
-
     pose = rotation, translation / np.linalg.norm(translation)
-    errors = residuals(pose)
+    return fit_to_lines(
+        pose,
+        points0,
+        points1,
+        np.full(len(points0), scale_px / 4),
+        lambda pose: fundamental_matrix(calibration, *pose),
+        moved_pose,
+        np.eye(5),
+    )
+
+
+def fit_to_lines(
+    start: T,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    sigmas: np.ndarray,
+    matrix_of: Callable[[T], np.ndarray],
+    moved: Callable[[T, np.ndarray], T],
+    axes: np.ndarray,
+    prior: Callable[[T], np.ndarray] = lambda _: np.empty(0),
+) -> T:
+    """Fit what determines a fundamental matrix to (M, 2) matches, with a Cauchy loss.
+
+    Levenberg-Marquardt begins at `start`. `moved` changes its parameters by a vector, and the rows
+    of `axes` are the unit vectors. Match errors and deviations from the `prior` are divided by
+    their standard deviations.
+    """
+    count, damping = len(points0), 1e-3
+
+    def residuals(view: T) -> np.ndarray:
+        errors = signed_epipolar_errors(points0, points1, matrix_of(view))
+        return np.append(errors / sigmas, prior(view))
+
+    def cost(errors: np.ndarray) -> float:
+        matches, usual = errors[:count], errors[count:]
+        return float(2 * np.log1p((matches / 2) ** 2).sum() + (usual**2).sum() / 2)
+
+    errors = residuals(start)
     lowest = cost(errors)
     for _ in range(MAX_ITERATIONS):
-        varied = (residuals(moved_pose(pose, axis)) for axis in np.eye(5) * DERIVATIVE_STEP)
-        slopes = np.column_stack([(other - errors) / DERIVATIVE_STEP for other in varied])
-        weights = 1 / (1 + (errors / (scale_px / 2)) ** 2)
-        normal = slopes.T @ (slopes * weights[:, None])
-        change = -np.linalg.lstsq(normal, slopes.T @ (weights * errors), rcond=None)[0]
-        while np.abs(change).max() > MIN_CHANGE:
-            moved = moved_pose(pose, change)
-            moved_errors = residuals(moved)
-            if cost(moved_errors) < lowest:
+        matrix, varied = matrix_of(start), [moved(start, axis * DERIVATIVE_STEP) for axis in axes]
+        of_matrix = np.stack([(matrix_of(each) - matrix).ravel() for each in varied], axis=1)
+        of_prior = np.stack([prior(each) - errors[count:] for each in varied], axis=1)
+        of_matches = epipolar_slopes(points0, points1, matrix) @ of_matrix / sigmas[:, None]
+        slopes = np.vstack([of_matches, of_prior]) / DERIVATIVE_STEP
+        weights = np.ones(len(errors))
+        weights[:count] = 1 / (1 + (errors[:count] / 2) ** 2)
+        normal, gradient = slopes.T @ (slopes * weights[:, None]), slopes.T @ (weights * errors)
+        before = lowest
+        while damping < 1e6:
+            damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
+            changed = moved(start, -np.linalg.solve(damped, gradient))
+            changed_errors = residuals(changed)
+            if cost(changed_errors) < lowest:
+                start, errors, lowest = changed, changed_errors, cost(changed_errors)
+                damping /= 5
                 break
-            change = change / 4
-        else:
+            damping *= 5
+        if before - lowest <= MIN_GAIN * before:
             break
-        pose, errors, lowest = moved, moved_errors, cost(moved_errors)
-    return pose
+    return start
 
 
 def moved_pose(pose: Pose, change: np.ndarray) -> Pose:

@@ -72,6 +72,23 @@ def signed_epipolar_errors(
     return algebraic
 
 
+def epipolar_slopes(
+    points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
+) -> np.ndarray:
+    """Return the (N, 9) derivatives of `signed_epipolar_errors` by the matrix, row by row."""
+    first, second = (np.column_stack([p, np.ones(len(p))]) for p in (points0, points1))
+    lines1, lines0 = first @ fundamental.T, second @ fundamental
+    algebraic = (second * lines1).sum(axis=1)
+    lines1[:, 2] = lines0[:, 2] = 0
+    squared = np.maximum((lines1**2 + lines0**2).sum(axis=1), 1e-300)[:, None]
+    # The derivative of a / sqrt(g), where a is x1^T F x0, and g the squared length of its gradient.
+    products = [
+        a[:, :, None] * b[:, None] for a, b in ((second, first), (lines1, first), (second, lines0))
+    ]
+    outer, of_lines = products[0].reshape(-1, 9), (products[1] + products[2]).reshape(-1, 9)
+    return np.asarray((outer - (algebraic[:, None] / squared) * of_lines) / np.sqrt(squared))
+
+
 def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """Multiply points (x, y, 1) by each row of a matrix; this is faster than a matrix product."""
     x, y = points[:, 0], points[:, 1]
