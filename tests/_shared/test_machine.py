@@ -20,8 +20,8 @@ from deepdetect._shared import machine
 from deepdetect._shared.errors import DeepDetectError, ImageError, OptionError
 from deepdetect._shared.machine import (
     available_memory,
+    limited_threads,
     map_in_processes,
-    one_blas_thread,
     parallel_for,
     require_memory,
 )
@@ -251,12 +251,12 @@ def test_blas_uses_one_thread_in_calls_that_overlap() -> None:
         entered, leave = threading.Event(), threading.Event()
 
         def call() -> None:
-            with one_blas_thread():
+            with limited_threads():
                 entered.set()
                 leave.wait(10)
 
         other = threading.Thread(target=call)
-        with one_blas_thread():
+        with limited_threads():
             other.start()
             entered.wait(10)
             assert blas_threads() == {1}

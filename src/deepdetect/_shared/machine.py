@@ -203,27 +203,21 @@ def use_one_thread() -> None:
 
 
 @contextmanager
-def limited_threads(threads: int | None) -> Iterator[None]:
-    """Limit how many threads each call in the block uses; None sets no new limit."""
-    before = getattr(_chosen, "threads", None)
-    _chosen.threads = threads or before
-    try:
-        with one_blas_thread():
-            yield
-    finally:
-        _chosen.threads = before
+def limited_threads(threads: int | None = None) -> Iterator[None]:
+    """Limit how many threads each call in the block uses; None sets no new limit.
 
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Let NumPy's matrix products use one thread while the block runs.
-
-    The matrices are small. More threads spend most of their time waiting for each other.
+    NumPy's matrix products use one thread: more of them spend their time waiting for each other,
+    because the matrices are small.
     """
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(1, user_api="blas"):
-        yield
+    before = getattr(_chosen, "threads", None)
+    _chosen.threads = threads or before
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        _chosen.threads = before
 
 
 def thread_limit() -> int | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.image_array import Channels
-from .._shared.machine import one_blas_thread, require_memory
+from .._shared.machine import limited_threads, require_memory
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
@@ -45,7 +45,7 @@ Points = tuple[np.ndarray, np.ndarray]
 
 
 @suggest_keywords
-@one_blas_thread()
+@limited_threads()
 def match_images(
     image0: Any,
     image1: Any,
@@ -129,7 +129,7 @@ def match_images(
 
 
 @suggest_keywords
-@one_blas_thread()
+@limited_threads()
 def match_features(
     features0: Keypoints,
     features1: Keypoints,

@@ -295,11 +295,6 @@ class View:
         structured = np.minimum(*gradients) > MIN_GRADIENT
         return Evidence(own, bound, float(chance.std()), contradicted, structured)
 
-    @property
-    def confirmed(self) -> bool:
-        """Whether the images confirm the geometry, and reject its displaced copies."""
-        return self.evidence.confirms and not self.repeated
-
     @cached_property
     def repeated(self) -> bool:
         """Whether a displaced copy explains the image as well as the geometry does."""
@@ -388,22 +383,14 @@ class View:
         here = np.dstack([x, y]).astype(np.float64)
         field = np.broadcast_to(shift.astype(np.float64), here.shape)
         result = translation_matrix(*shift)
-        every = slice(None, None, 2)
+        every = np.s_[::2, ::2]
+        cells, places = self._first[every], here[every]
         for reach, step in ((4, 2), (2, 1)):
-            around = [
-                (float(i), float(j))
-                for j in range(-reach, reach + 1, step)
-                for i in range(-reach, reach + 1, step)
-            ]
+            steps = np.arange(-reach, reach + 1, step, dtype=float)
+            around, moves = np.dstack(np.meshgrid(steps, steps)).reshape(-1, 2), field[every]
             near = np.stack(
                 [
-                    gathered(
-                        self._first[every, every],
-                        self._second,
-                        self._valid,
-                        field[every, every] + each,
-                        here[every, every],
-                    )
+                    gathered(cells, self._second, self._valid, moves + each, places)
                     for each in around
                 ]
             )
@@ -411,8 +398,8 @@ class View:
             good = near.max(axis=0) > self.evidence.bound
             if np.count_nonzero(good) < 2 * WINDOW_CELLS:
                 return result, field
-            starts = here[every, every][good]
-            ends = starts + field[every, every][good] + np.array(around)[near.argmax(axis=0)[good]]
+            starts = places[good]
+            ends = starts + moves[good] + around[near.argmax(axis=0)[good]]
             options = GeometryOptions(inlier_threshold=1.5)
             matrix = estimate_geometry(starts, ends, "homography", options=options).matrix
             if matrix is None:

@@ -11,7 +11,7 @@ import numpy as np
 from ..._shared.alpha import continued
 from ..._shared.errors import OptionError, check_name
 from ..._shared.image_array import Channels, from_16_bits, to_8_bits
-from ..._shared.machine import one_blas_thread
+from ..._shared.machine import limited_threads
 from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.progress import StageTimer
 from ..._shared.value_range import ValueRange
@@ -112,7 +112,7 @@ def stages_of(count: int) -> list[str]:
 
 
 @suggest_keywords
-@one_blas_thread()
+@limited_threads()
 def stitch(
     images: Sequence[Any],
     detector: AnyDetector | None = None,

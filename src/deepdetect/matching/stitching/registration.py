@@ -239,10 +239,11 @@ def _register(
     matrix = PlaneTracks(pair, homography).homography
     view = judge.along_plane(matrix)
     still = stands_still(homography, pair.sizes)
-    if not view.confirmed or view.evidence.share < (MIN_STILL if still else MIN_EXPLAINED):
+    evidence, least = view.evidence, MIN_STILL if still else MIN_EXPLAINED
+    if not evidence.confirms or evidence.share < least or view.repeated:
         return None
     pixels = np.rint(a.keypoints), np.rint(b.keypoints)
-    matches = match_along_plane(pair, pixels, matrix, judge, view.evidence)
+    matches = match_along_plane(pair, pixels, matrix, judge, evidence)
     points = a.keypoints[matches.indices0]
     if len(points) < MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels):
         return None
