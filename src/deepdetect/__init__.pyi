@@ -24,6 +24,7 @@ from .io.tables import (
     save_matches as save_matches,
 )
 from .matching.pipeline import match_features as match_features, match_images as match_images
+from .matching.refinement import refine_matches as refine_matches
 from .matching.registration import register as register
 from .matching.stereo.matching import disparity_map as disparity_map
 from .matching.stitching import stitch as stitch

@@ -12,7 +12,14 @@ from deepdetect.geometry import (
     transform_points,
 )
 from deepdetect.geometry.images import downscale
-from deepdetect.geometry.transforms import scaled_fundamental, scaled_homography, scaled_points
+from deepdetect.geometry.transforms import (
+    epipolar_slopes,
+    homography_derivatives,
+    scaled_fundamental,
+    scaled_homography,
+    scaled_points,
+    signed_epipolar_errors,
+)
 
 
 def cross_matrix(t: np.ndarray) -> np.ndarray:
@@ -181,3 +188,26 @@ def test_a_scaled_fundamental_matrix_fits_scaled_points() -> None:
     matrix = scaled_fundamental(fundamental, 2.5, 0.3)
     scaled = scaled_points(points0, 2.5), scaled_points(points1, 0.3)
     np.testing.assert_allclose(epipolar_errors(*scaled, matrix), 0, atol=1e-8)
+
+
+def test_derivatives_of_epipolar_errors_by_the_matrix() -> None:
+    points0, points1, fundamental = two_cameras()
+    points1 = points1 + np.random.default_rng(1).normal(0, 2, points1.shape)
+    matrix = fundamental / np.linalg.norm(fundamental)
+    slopes, step = epipolar_slopes(points0, points1, matrix), 1e-8
+    for number, axis in enumerate(np.eye(9).reshape(9, 3, 3) * step):
+        ahead, behind = (
+            signed_epipolar_errors(points0, points1, matrix + sign * axis) for sign in (1, -1)
+        )
+        expected = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(slopes[:, number], expected, rtol=1e-4, atol=1e-3)
+
+
+def test_derivatives_of_a_homography() -> None:
+    homography = np.array([[1.1, 0.2, 5], [-0.1, 0.9, 7], [4e-4, -3e-4, 1]])
+    points, step = np.random.default_rng(0).uniform(0, 500, (20, 2)), 1e-4
+    found = homography_derivatives(points, homography)
+    for axis in (0, 1):
+        moves = np.eye(2)[axis] * step
+        ahead, behind = (transform_points(points + s * moves, homography) for s in (1, -1))
+        np.testing.assert_allclose(found[:, :, axis], (ahead - behind) / (2 * step), atol=1e-6)

@@ -15,7 +15,7 @@ from deepdetect._shared.errors import NoDepthError, ReconstructionError
 from deepdetect._shared.progress import StageTimer
 from deepdetect.geometry.camera import Calibration
 from deepdetect.geometry.two_view import fit_model
-from deepdetect.reconstruction.subpixel import refine_matches
+from deepdetect.reconstruction.subpixel import refine_dense
 from deepdetect.reconstruction.two_view import MAX_SCENE_DISTANCE_PX, NO_DEPTH, checked_pose
 
 SIZE = (370, 250)
@@ -32,7 +32,7 @@ def scaled(calibration: Calibration, factor: float) -> Calibration:
 @pytest.fixture(scope="module")
 def refined(turned: Any, turned_matches: Matches) -> tuple[np.ndarray, np.ndarray]:
     points0 = turned_matches.points0.astype(float)
-    points1, converged = refine_matches(*turned.grays, points0, turned_matches.points1)
+    points1, converged = refine_dense(*turned.grays, points0, turned_matches.points1)
     return points0[converged][::3], points1[converged][::3]
 
 

@@ -10,7 +10,7 @@ from deepdetect import Matches
 from deepdetect.io.image import luma
 from deepdetect.reconstruction.subpixel import (
     local_affinities,
-    refine_matches,
+    refine_dense,
     similarity,
     spread_corners,
 )
@@ -45,7 +45,7 @@ def errors(found: tuple[np.ndarray, np.ndarray], expected: np.ndarray) -> np.nda
 def test_known_shifts_are_found(
     gray: np.ndarray, pixels: np.ndarray, shift: tuple[float, float]
 ) -> None:
-    found = refine_matches(gray, moved(gray, *shift), pixels, pixels)
+    found = refine_dense(gray, moved(gray, *shift), pixels, pixels)
     assert found[1].mean() > 0.7
     assert np.median(errors(found, pixels + shift)) < 0.04
     assert (errors(found, pixels + shift) < 0.25).mean() > 0.9
@@ -57,18 +57,18 @@ def test_known_shifts_are_found(
 def test_the_light_does_not_matter(gray: np.ndarray, pixels: np.ndarray) -> None:
     other = moved(gray, 0.4, -0.3)
     dim = np.clip(other * 0.6 + 30, 0, 255).astype(np.uint8)
-    plain, lit = (refine_matches(gray, image, pixels, pixels) for image in (other, dim))
+    plain, lit = (refine_dense(gray, image, pixels, pixels) for image in (other, dim))
     both = plain[1] & lit[1]
     assert both.mean() > 0.65
     assert np.median(np.linalg.norm(plain[0] - lit[0], axis=1)[both]) < 0.03
-    assert not refine_matches(gray, 255 - gray, pixels, pixels)[1].any()
+    assert not refine_dense(gray, 255 - gray, pixels, pixels)[1].any()
 
 
 def test_a_turn_is_followed(gray: np.ndarray, pixels: np.ndarray) -> None:
     turn = cv2.getRotationMatrix2D((128, 110), 12, 1.1)
     other = cv2.warpAffine(gray, turn, gray.shape[::-1], flags=cv2.INTER_CUBIC)
     true = pixels @ turn[:, :2].T + turn[:, 2]
-    found = refine_matches(gray, other, pixels, np.rint(true))
+    found = refine_dense(gray, other, pixels, np.rint(true))
     inside = ((true > 8) & (true < np.array(gray.shape[::-1]) - 9)).all(1)
     assert found[1][inside].mean() > 0.8
     assert not found[1][((true < 0) | (true > gray.shape[::-1])).any(1)].any()
@@ -80,7 +80,7 @@ def test_a_turn_is_followed(gray: np.ndarray, pixels: np.ndarray) -> None:
 def test_real_matches_come_nearer_to_the_truth(turned: Any, turned_matches: Matches) -> None:
     points0, points1 = turned_matches.points0, np.rint(turned_matches.points1)
     true = turned.match(points0)
-    refined, converged = refine_matches(*turned.grays, points0, points1)
+    refined, converged = refine_dense(*turned.grays, points0, points1)
     assert converged.mean() > 0.7
     known = np.isfinite(true).all(1) & converged
     before, after = (np.linalg.norm(points - true, axis=1)[known] for points in (points1, refined))
@@ -91,14 +91,14 @@ def test_real_matches_come_nearer_to_the_truth(turned: Any, turned_matches: Matc
 def test_what_cannot_be_aligned_stays_and_says_so(gray: np.ndarray) -> None:
     pixels = np.array([[100, 100], [0, 0], [255, 219], [100, 100]])
     start = np.array([[100.25, 100.0], [0, 0], [255, 219], [140, 30]])
-    points, converged = refine_matches(gray, gray, pixels, start)
+    points, converged = refine_dense(gray, gray, pixels, start)
     assert converged.tolist() == [True, False, False, False]
     np.testing.assert_array_equal(points[1:], start[1:])
     assert points[0] == pytest.approx((100, 100), abs=0.01)
     flat = np.full_like(gray, 90)
     stripes = np.broadcast_to(np.uint8(100 + 80 * np.sin(np.arange(256) / 3)), (220, 256)).copy()
     for images in ((flat, gray), (gray, flat), (flat, flat), (stripes, stripes)):
-        assert not refine_matches(*images, pixels, start)[1].any()
+        assert not refine_dense(*images, pixels, start)[1].any()
 
 
 def test_corners_come_from_all_parts_of_the_image_each_once(

@@ -32,6 +32,7 @@ from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_pict
 from ..io.projection import require_pinhole
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
+from ..matching.refinement import refine_matches
 from ..matching.registration import register as register_images
 from ..matching.stitching import StitchingOptions, stages_of
 from ..matching.stitching import stitch as stitch_images
@@ -65,6 +66,7 @@ def match(
     pairs: str = "exhaustive",
     detector: Detector = "network",
     unguided: Annotated[bool, Parameter(negative="")] = False,
+    refine: Annotated[bool, Parameter(negative="")] = False,
     homography: cli.More[Path | None] = None,
     camera0: cli.More[Path | None] = None,
     camera1: cli.More[Path | None] = None,
@@ -77,8 +79,8 @@ def match(
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
     estimated geometry and its inliers, and a visualisation. The options --descriptor, --matcher,
-    --filter-by and --ratio are for --unguided. The exit code is 3 if nothing matches, or if no
-    geometry between the images can be trusted.
+    --filter-by, --ratio and --refine are for --unguided. The exit code is 3 if nothing matches, or
+    if no geometry between the images can be trusted.
 
         deepdetect match left.jpg right.jpg
         deepdetect match page1.jpg page2.jpg --model homography --mutual
@@ -89,6 +91,7 @@ def match(
         pairs: Which of more than two images to match: exhaustive (all pairs), sequential:1 (each
             image with the next by name), or a text file with the names of two images on each line.
         unguided: Match by descriptors alone over the whole image, then estimate a geometry.
+        refine: Align the image around each match, to move it to a fraction of a pixel.
         homography: Text file with a known 3x3 homography from the first image to the second.
             Matches that agree with it are the inliers.
         camera0: Text file with the 3x3 intrinsic matrix of camera 0, for --model essential.
@@ -106,6 +109,7 @@ def match(
     by_descriptors = UNGUIDED.take(values)
     if not unguided:
         flags = [*by_descriptors, *(["descriptor"] if "descriptor" in values else [])]
+        flags += ["refine"] if refine else []
         for name in flags:
             raise OptionError(f"`{name}` is for --unguided: add that option, or leave `{name}` out")
     chosen, selection = chosen_detector(detector, values, options=DESCRIBED_POINTS)
@@ -116,7 +120,7 @@ def match(
     geometry = GeometryOptions(**known, **GEOMETRY.take(values))
     match_pair: Callable[..., Matches] = match_images
     if unguided:
-        match_pair = partial(_match_unguided, **by_descriptors)
+        match_pair = partial(_match_unguided, refine=refine, **by_descriptors)
     stages = UNGUIDED_STAGES if unguided else GUIDED_STAGES[detector == "points" :]
     of_pinholes = partial(_load_of_pinhole, rim=unguided)
     flat = values.get("model") == "homography"
@@ -180,6 +184,7 @@ def _match_unguided(
     progress: Callable[[str], object],
     model: str = "auto",
     seed: int = 0,
+    refine: bool = False,
     **values: Any,
 ) -> Matches:
     timer = StageTimer(progress)
@@ -188,6 +193,8 @@ def _match_unguided(
         features = [detector.extract(image, **chosen) for image in (image0, image1)]
     with timer.stage("matching"):
         matches = match_features(*features, seed=seed, **values)
+        if refine:
+            matches = refine_matches(image0, image1, matches)
     with timer.stage("geometry"):
         found = estimate_geometry(matches, model=model, seed=seed, options=options)
         matches = matches.with_geometry(found, options.inlier_threshold)

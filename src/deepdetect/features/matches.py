@@ -203,6 +203,8 @@ class Matches:
             `mutual`, these roles may be swapped. None: the nearest keypoints are looked up.
         layer: (M,) int8 index in `geometry.layers` of the geometry that a match follows; -1 (or
             None for all) without layers. `m[m.layer == 0]` has the matches of the scene.
+        covariances: (M, 2, 2) float32 covariances of `points1` relative to `points0`, in square
+            pixels, from `refine_matches`; otherwise None.
 
     With the same options, an index means the same keypoint in all pairs with this image, because
     keypoints do not depend on the other image. So matches of several pairs can be joined to tracks.
@@ -234,6 +236,7 @@ class Matches:
     indices0: np.ndarray = None  # type: ignore[assignment]  # never None after construction
     indices1: np.ndarray = None  # type: ignore[assignment]
     layer: np.ndarray = None  # type: ignore[assignment]
+    covariances: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name, dtype in _COLUMNS.items():
@@ -276,6 +279,13 @@ class Matches:
         if layer.shape != (len(self),):
             raise OptionError(f"matches need one number per match in layer, not {layer.shape}")
         object.__setattr__(self, "layer", layer.astype(np.int8))
+        if self.covariances is not None:
+            covariances = numbers_of("covariances", self.covariances, np.float32)
+            if covariances.shape != (len(self), 2, 2):
+                raise OptionError(
+                    f"matches need a 2x2 matrix per match in covariances, not {covariances.shape}"
+                )
+            object.__setattr__(self, "covariances", covariances)
 
     def __getstate__(self) -> dict[str, Any]:
         # The pickled state holds the keypoints themselves, not functions that detect them.
@@ -362,7 +372,7 @@ class Matches:
         return self[kept]
 
     def swapped(self) -> Matches:
-        """Return the same matches from the second image to the first."""
+        """Return the same matches from the second image to the first, without covariances."""
         geometry = self.geometry
         return replace(
             self,
@@ -373,6 +383,7 @@ class Matches:
             geometry=None if geometry is None else geometry.swapped(),
             indices0=self.indices1,
             indices1=self.indices0,
+            covariances=None,
         )
 
     @suggest_keywords
@@ -413,7 +424,8 @@ class Matches:
 
     def __getitem__(self, index: slice | np.ndarray | Sequence[int] | int) -> Matches:
         rows = [int(index)] if isinstance(index, (int, np.integer)) else index
-        names = (*_COLUMNS, "indices0", "indices1", "layer")
+        names = [*_COLUMNS, "indices0", "indices1", "layer"]
+        names += [] if self.covariances is None else ["covariances"]
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def _repr_html_(self) -> str:

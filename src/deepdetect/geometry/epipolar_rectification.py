@@ -18,7 +18,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .camera import Size
-from .transforms import transform_points, translation_matrix
+from .transforms import homography_derivatives, transform_points, translation_matrix
 
 Both = tuple[np.ndarray, np.ndarray]
 
@@ -198,7 +198,10 @@ def _planar_frame(
         depth = (border @ matrix[2, :2] + matrix[2, 2]) / (middle @ matrix[2, :2] + matrix[2, 2])
         if depth.min() <= 0 or max(depth.max(), 1 / depth.min()) > MAX_STRETCH:
             return None
-    jacobians = [_jacobian(*each) for each in zip(matrices, middles, strict=True)]
+    jacobians = [
+        homography_derivatives(np.array([middle]), matrix)[0]
+        for matrix, middle in zip(matrices, middles, strict=True)
+    ]
     areas = np.linalg.det(jacobians)
     if areas.min() <= 0:
         return None
@@ -256,10 +259,3 @@ def _polar_frame(
 def _corners(size: Size) -> np.ndarray:
     right, bottom = size[0] - 1, size[1] - 1
     return np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]], np.float64)
-
-
-def _jacobian(homography: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Return the (2, 2) derivative of a homography at a point."""
-    mapped = homography @ np.append(point, 1)
-    position = mapped[:2] / mapped[2]
-    return (homography[:2, :2] - np.outer(position, homography[2, :2])) / mapped[2]

@@ -136,6 +136,14 @@ def score_errors(errors: np.ndarray) -> dict[str, float]:
     return counts | {"precision": correct / evaluated if evaluated else 0.0}
 
 
+def homography_derivatives(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Return the (N, 2, 2) derivatives of a homography at (N, 2) points."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    depth = mapped[:, 2, None, None]
+    by_depth = mapped[:, :2, None] * homography[2, :2]
+    return np.asarray(homography[:2, :2] / depth - by_depth / depth**2)
+
+
 def translation_matrix(x: float, y: float) -> np.ndarray:
     """Return the (3, 3) homography that moves positions by (x, y)."""
     return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])

@@ -22,6 +22,7 @@ OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
 
 MATCH_VALUES = (
     *("points0", "points1", "scores", "inliers", "subpixel", "indices0", "indices1", "layer"),
+    "covariances",
 )
 """An npz file contains these attributes of `Matches`, in addition to keypoints and geometry."""
 
@@ -85,13 +86,13 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         path: ending in .npz or .csv. An npz file has the attributes of `Matches`: `points0` and
             `points1` (M, 2) float32, `indices0` and `indices1` (M,) int32 (the rows of the matched
             keypoints in `keypoints0` and `keypoints1`), `scores` (M,) float32, `inliers` (M,) bool,
-            `layer` (M,) int8 and `subpixel` bool. The keypoints of the first image are `keypoints0`
-            (N, 2) float32, `keypoint_scores0` (N,) float32 and `image_size0` (width, height); the
-            names for the second image end in 1. If there is a geometry, the file has the strings
-            `model`, `scene` and `confidence`, the (3, 3) `matrix` (if unknown, an empty (0, 0)
-            array), the numbers of `Evidence`, and its L layers as `layer_model` (L,),
-            `layer_matrix` (L, 3, 3) and `layer_share` (L,). A CSV file has the columns x0, y0, x1,
-            y1, score, inlier.
+            `layer` (M,) int8, `subpixel` bool and `covariances` (M, 2, 2) float32. The keypoints of
+            the first image are `keypoints0` (N, 2) float32, `keypoint_scores0` (N,) float32 and
+            `image_size0` (width, height); the names for the second image end in 1. If there is a
+            geometry, the file has the strings `model`, `scene` and `confidence`, the (3, 3)
+            `matrix`, the numbers of `Evidence`, and its L layers as `layer_model` (L,),
+            `layer_matrix` (L, 3, 3) and `layer_share` (L,). What is unknown is an empty (0, 0)
+            array. A CSV file has the columns x0, y0, x1, y1, score, inlier.
 
     Raises:
         OptionError: the path has another ending.

@@ -8,24 +8,20 @@ Middlebury's Motorcycle, 65 % of the converged matches were accurate to 0.25 px.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
+from ..geometry.alignment import Alignment, align_patches
 from ..geometry.images import window_sums
 
 PATCH_RADIUS_PX = 4
 """The side of a patch is 2 * radius + 1 pixels, and its pixels have Gaussian weights with a sigma
 of radius / 2. Chosen by hand."""
 
-MAX_ITERATIONS = 15
-"""Each of the two alignments of a patch takes at most this number of steps. Chosen by hand."""
-
 MAX_SHIFT_PX = 2.0
 """A match may move by at most this distance in each of the two alignments. Chosen by hand."""
-
-MIN_CORRELATION = 0.8
-"""A match has converged only if its patches correlate at least this much. Chosen by hand."""
 
 CONVERGENCE_PX, COARSE_CONVERGENCE_PX = 0.01, 0.05
 """The first alignment ends at a step shorter than COARSE_CONVERGENCE_PX, because it only prepares
@@ -45,7 +41,7 @@ CORNER_WINDOW_PX = 7
 """Side of the window in which the strength of a corner is measured, about that of a patch."""
 
 
-def refine_matches(
+def refine_dense(
     gray0: np.ndarray, gray1: np.ndarray, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine the (N, 2) positions of matches in the second image to sub-pixel accuracy.
@@ -59,16 +55,20 @@ def refine_matches(
     start = np.array(points1, np.float64, order="C")
     inside = np.asarray(((start >= 0) & (start < gray1.shape[::-1])).all(axis=1))
     if not inside.all():
-        start[inside], inside[inside] = refine_matches(gray0, gray1, pixels0[inside], start[inside])
+        start[inside], inside[inside] = refine_dense(gray0, gray1, pixels0[inside], start[inside])
         return start, inside
     if not len(pixels0):
         return start, inside
     images = gray0.astype(np.float32), gray1.astype(np.float32)
     overall = similarity(pixels0, start)
     affinities = np.broadcast_to(overall, (len(start), 2, 2))
-    start, converged = align_patches(images, pixels0, start, affinities, COARSE_CONVERGENCE_PX)
+    coarse = Alignment(PATCH_RADIUS_PX, MAX_SHIFT_PX, COARSE_CONVERGENCE_PX)
+    found = align_patches(images, pixels0, start, affinities, coarse)
+    start, converged = found.points1, found.converged
     affinities = local_affinities(pixels0, start, converged, gray0.shape, overall)
-    return align_patches(images, pixels0, start, affinities)
+    fine = replace(coarse, convergence_px=CONVERGENCE_PX)
+    found = align_patches(images, pixels0, start, affinities, fine)
+    return found.points1, found.converged
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
@@ -134,31 +134,3 @@ def local_affinities(
         result[:, axis, 0] = (yy * by_x - xy * by_y) / (xx * yy - xy**2)
         result[:, axis, 1] = (xx * by_y - xy * by_x) / (xx * yy - xy**2)
     return (result + overall).astype(np.float32)
-
-
-def align_patches(
-    images: tuple[np.ndarray, np.ndarray],
-    pixels0: np.ndarray,
-    start: np.ndarray,
-    affinities: np.ndarray,
-    convergence_px: float = CONVERGENCE_PX,
-    radius_px: int = PATCH_RADIUS_PX,
-    max_shift_px: float = MAX_SHIFT_PX,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Align patches of the first image, each warped by its affinity, to the second image.
-
-    The images are (H, W) float32. `pixels0` are the centres of the patches, (N, 2) int64, `start`
-    their initial positions in the second image, (N, 2) float64, and `affinities` is (N, 2, 2).
-    Returns the same as `refine_matches`.
-    """
-    from .subpixel_kernel import align
-
-    offsets = np.arange(-radius_px, radius_px + 1)
-    window = np.exp(-2 * (offsets[:, None] ** 2 + offsets**2) / radius_px**2).astype(np.float32)
-    affinities = np.ascontiguousarray(affinities, np.float32)
-    refined = np.empty((len(pixels0), 2))
-    converged = np.empty(len(pixels0), bool)
-    limits = MAX_ITERATIONS, convergence_px, max_shift_px, np.float32(MIN_CORRELATION)
-    given = *images, pixels0, start, affinities, window, *limits
-    parallel_for(len(pixels0), align, *given, refined, converged)
-    return refined, converged

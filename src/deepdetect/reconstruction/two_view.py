@@ -21,7 +21,7 @@ from ..geometry.camera import Calibration, Camera, fundamental_matrix
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose, triangulate
 from ..geometry.two_view import SCENE_THRESHOLDS_PX
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
-from .subpixel import refine_matches, spread_corners
+from .subpixel import refine_dense, spread_corners
 
 MAX_EPIPOLAR_DISTANCE_PX, MAX_REPROJECTION_ERROR_PX = 1.0, 0.5
 """A match agrees with the pose if its Sampson distance is below MAX_EPIPOLAR_DISTANCE_PX, and its
@@ -77,7 +77,7 @@ def refined_corners(
     """Return the matches at corners that converge to sub-pixel accuracy, as two (K, 2) arrays."""
     pixels0 = np.rint(points0)
     rows = spread_corners(images[0], pixels0, POSE_CELLS)
-    refined, converged = refine_matches(*images, pixels0[rows], points1[rows])
+    refined, converged = refine_dense(*images, pixels0[rows], points1[rows])
     return pixels0[rows][converged], refined[converged]
 
 

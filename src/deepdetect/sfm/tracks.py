@@ -18,9 +18,10 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .._shared.progress import progress
+from ..geometry.alignment import Alignment, align_patches
 from ..geometry.camera import PosedView
 from ..io.image import load_image, luma
-from ..reconstruction.subpixel import align_patches, spread_corners
+from ..reconstruction.subpixel import CONVERGENCE_PX, spread_corners
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .mapping import RegisteredImage, SparseModel, read_sparse_model
 
@@ -217,10 +218,9 @@ class _Tracks:
         )
         grays = self.read(image.view.name)[1], self.read(other.view.name)[1]
         given = pixels[rows], np.ascontiguousarray(start[rows, :2]), affinities[rows]
-        xy, converged = align_patches(
-            grays, *given, radius_px=PATCH_RADIUS_PX, max_shift_px=MAX_SHIFT_PX
-        )
-        return rows[converged], xy[converged]
+        how = Alignment(PATCH_RADIUS_PX, MAX_SHIFT_PX, CONVERGENCE_PX)
+        found = align_patches(grays, *given, how)
+        return rows[found.converged], found.points1[found.converged]
 
     def write(self, model: Any) -> None:
         """Replace the tracks of a `pycolmap.Reconstruction` by the tracks found here."""
