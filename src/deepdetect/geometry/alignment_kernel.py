@@ -70,6 +70,60 @@ def _inverted(matrix, inverse, size):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, fastmath=True)
+def _prepare(image, x0, y0, weight, radius, free, ridge, cubic, ring, template, slope, inverse):  # type: ignore[no-untyped-def]
+    """Write a patch without its mean, its derivatives, and the inverse of their normal matrix.
+
+    Returns the variance of the patch; 0 if the patch does not tell its position.
+    """
+    side = 2 * radius + 1
+    count, wide = side * side, side + 2
+    normal = np.empty((6, 6))
+    _read(image, x0, y0, 1.0, 0.0, 0.0, 1.0, radius + 1, cubic, ring)
+    mean, j = np.float32(0), 0
+    for row in range(1, side + 1):
+        for column in range(1, side + 1):
+            at = row * wide + column
+            template[j] = ring[at]
+            mean += weight[j] * ring[at]
+            slope[0, j] = np.float32(0.5) * (ring[at + 1] - ring[at - 1])
+            slope[1, j] = np.float32(0.5) * (ring[at + wide] - ring[at - wide])
+            if free == 6:
+                across, down = np.float32(column - 1 - radius), np.float32(row - 1 - radius)
+                slope[2, j], slope[3, j] = slope[0, j] * across, slope[0, j] * down
+                slope[4, j], slope[5, j] = slope[1, j] * across, slope[1, j] * down
+            j += 1
+    # Subtracting the means eliminates the offset. The gain is eliminated in the next loop.
+    tt = np.float32(0)
+    for j in range(count):
+        template[j] -= mean
+        tt += weight[j] * template[j] * template[j]
+    if tt < np.float32(1e-3):
+        return np.float32(0)
+    for one in range(free):
+        mean, gain = np.float32(0), np.float32(0)
+        for j in range(count):
+            mean += weight[j] * slope[one, j]
+        for j in range(count):
+            slope[one, j] -= mean
+            gain += weight[j] * slope[one, j] * template[j]
+        for j in range(count):
+            slope[one, j] -= gain / tt * template[j]
+        for other in range(one + 1):
+            total = np.float32(0)
+            for j in range(count):
+                total += weight[j] * slope[one, j] * slope[other, j]
+            normal[one, other] = normal[other, one] = total
+    trace = normal[0, 0] + normal[1, 1]
+    round_off = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2 <= 1e-6 * trace**2
+    if round_off or trace <= 0:
+        return np.float32(0)
+    for one in range(free):
+        normal[one, one] += ridge * trace * (1.0 if one < 2 else radius**2 / 4)
+    _inverted(normal, inverse, free)
+    return tt
+
+
+@compiled(nogil=True, fastmath=True)
 def align(  # type: ignore[no-untyped-def]
     first,
     last,
@@ -107,7 +161,7 @@ def align(  # type: ignore[no-untyped-def]
     count, wide = side * side, side + 2
     template, seen = np.empty(count, np.float32), np.empty(count, np.float32)
     ring, slope = np.empty(wide * wide, np.float32), np.empty((6, count), np.float32)
-    normal, inverse, step = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
+    inverse, step = np.empty((6, 6)), np.empty(6)
     weight = window.reshape(-1) / window.sum()
     for k in range(first, last):
         x0, y0 = points0[k, 0], points0[k, 1]
@@ -115,48 +169,11 @@ def align(  # type: ignore[no-untyped-def]
         correlations[k] = 0
         if not (reach <= x0 <= width0 - 1 - reach and reach <= y0 <= height0 - 1 - reach):
             continue
-        _read(image0, x0, y0, 1.0, 0.0, 0.0, 1.0, radius + 1, cubic, ring)
-        mean, j = np.float32(0), 0
-        for row in range(1, side + 1):
-            for column in range(1, side + 1):
-                at = row * wide + column
-                template[j] = ring[at]
-                mean += weight[j] * ring[at]
-                slope[0, j] = np.float32(0.5) * (ring[at + 1] - ring[at - 1])
-                slope[1, j] = np.float32(0.5) * (ring[at + wide] - ring[at - wide])
-                if free == 6:
-                    across, down = np.float32(column - 1 - radius), np.float32(row - 1 - radius)
-                    slope[2, j], slope[3, j] = slope[0, j] * across, slope[0, j] * down
-                    slope[4, j], slope[5, j] = slope[1, j] * across, slope[1, j] * down
-                j += 1
-        # Subtracting the means eliminates the offset. The gain is eliminated in the next loop.
-        tt = np.float32(0)
-        for j in range(count):
-            template[j] -= mean
-            tt += weight[j] * template[j] * template[j]
-        if tt < np.float32(1e-3):
+        tt = _prepare(
+            image0, x0, y0, weight, radius, free, ridge, cubic, ring, template, slope, inverse
+        )
+        if tt == 0:
             continue
-        for one in range(free):
-            mean, gain = np.float32(0), np.float32(0)
-            for j in range(count):
-                mean += weight[j] * slope[one, j]
-            for j in range(count):
-                slope[one, j] -= mean
-                gain += weight[j] * slope[one, j] * template[j]
-            for j in range(count):
-                slope[one, j] -= gain / tt * template[j]
-            for other in range(one + 1):
-                total = np.float32(0)
-                for j in range(count):
-                    total += weight[j] * slope[one, j] * slope[other, j]
-                normal[one, other] = normal[other, one] = total
-        trace = normal[0, 0] + normal[1, 1]
-        round_off = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2 <= 1e-6 * trace**2
-        if round_off or trace <= 0:
-            continue
-        for one in range(free):
-            normal[one, one] += ridge * trace * (1.0 if one < 2 else radius**2 / 4)
-        _inverted(normal, inverse, free)
         a, b, c, d = (
             affinities[k, 0, 0],
             affinities[k, 0, 1],
