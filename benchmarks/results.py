@@ -81,6 +81,7 @@ STAGES = {
     "mappers": "benchmarks/mappers.py",
     "scale": "benchmarks/scale.py {data}/photos --work {output}",
     "match-filter": "benchmarks/match_filter.py {data}",
+    "exact-matches": "benchmarks/exact_matches.py {data}",
     "modalities": f"benchmarks/modalities.py {{data}}/multimodal{XFEAT}{E64}",
     "made-scenes": "benchmarks/made_scenes.py {data} --scenes {output}/scenes",
 }
@@ -296,6 +297,7 @@ RESULTS = {
     "mappers": Result("mappers", "0"),
     "scale": Result("scale", "0"),
     "match-filter": Result("match-filter", "0"),
+    "exact-matches": Result("exact-matches", "0"),
     "modalities": Result("modalities", "0"),
     "made-scenes": Result("made-scenes", "0"),
     "foreground": Result(
