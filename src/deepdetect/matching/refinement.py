@@ -37,7 +37,16 @@ CERTAIN = 0.95
 """Matches with a correlation of at least this are not tried with another first affinity."""
 
 MIN_SIGMA_PX = 0.05
-"""Minimum standard deviation of a refined position along each axis. Chosen by hand."""
+"""Minimum standard deviation of an aligned position along each axis. Chosen by hand."""
+
+POINT_SIGMA_PX, PIXEL_SIGMA_PX = 1.0, 0.35
+"""Standard deviation along each axis of a match before refinement: of keypoints with sizes, and of
+whole pixels, where rounding alone causes 0.29. Alignments are averaged with what was known before,
+so that a patch that shows only an edge moves across it. Of guided matches of graf 1-2, wall 1-3,
+leuven 1-4 and bikes 1-3, 0.58 to 0.70 are within 0.5 px, refined so 0.73 to 0.92."""
+
+MAX_DEVIATIONS = 3.0
+"""An alignment is rejected if it moves a match by more than this number of standard deviations."""
 
 
 @suggest_keywords
@@ -58,8 +67,8 @@ def refine_matches(
 
     Returns:
         The same matches, with new `points1` and with `covariances`. A match that cannot be aligned,
-        for example since the images differ too much there, keeps its position, and has a standard
-        deviation of 3 pixels.
+        for example since the images differ too much there, keeps its position, and has the standard
+        deviation of matches before: 1 pixel, or 0.35 pixels if the keypoints are whole pixels.
 
     Raises:
         ImageError: an image cannot be read, or has another size than its keypoints' image.
@@ -94,9 +103,16 @@ def refine_matches(
     found = _aligned(grays, sigmas, points0, points1, starts)
     # Noise of pixels that are blurred by a Gaussian is correlated within 4 pi sigma^2 pixels.
     correlated = 4 * np.pi * (BASE_SIGMA_PX**2 + max(sigmas) ** 2)
-    covariances = correlated * found.covariances + MIN_SIGMA_PX**2 * np.eye(2)
-    covariances[~found.converged] = ALIGNMENT.max_shift_px**2 * np.eye(2)
-    return replace(matches, points1=found.points1, covariances=covariances)
+    measured = correlated * found.covariances + MIN_SIGMA_PX**2 * np.eye(2)
+    exact = PIXEL_SIGMA_PX if matches.keypoints1.sizes is None else POINT_SIGMA_PX
+    known = exact**2 * np.eye(2)
+    moved, inverse = found.points1 - points1, np.linalg.inv(measured + known)
+    deviations = np.einsum("ni,nij,nj->n", moved, inverse, moved) ** 0.5
+    aligned = (found.converged & (deviations < MAX_DEVIATIONS))[:, None]
+    gain = known @ inverse
+    moved = np.where(aligned, np.einsum("nij,nj->ni", gain, moved), 0)
+    covariances = np.where(aligned[:, None], gain @ measured, known)
+    return replace(matches, points1=points1 + moved, covariances=covariances)
 
 
 def _first_affinities(matches: Matches) -> Iterator[np.ndarray]:
