@@ -66,6 +66,18 @@ def test_options_reach_the_matcher(
     assert report["geometry"] == told
 
 
+@pytest.mark.parametrize("way", [("--unguided", "--detector", "points"), ("--model", "homography")])
+def test_refined_matches_have_covariances(run, photos: Path, way: tuple[str, ...]) -> None:
+    result = run(
+        *("match", photos / "left.png", photos / "left.png", "--no-pictures", "--refine", *way),
+        *("-o", "out"),
+    )
+    assert result.exit_code == 0, result.output
+    matches = load_matches("out/left_left_matches.npz")
+    assert matches.covariances is not None
+    assert np.abs(matches.points1 - matches.points0).max() < 0.01
+
+
 def test_options_of_descriptors_are_for_unguided_matches(run, photos: Path) -> None:
     for words in (("--ratio", 0.8), ("--matcher", "exact"), ("--descriptor", "rootsift")):
         how = ("--detector", "points", *words)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -77,7 +79,7 @@ def test_matches_are_exact_to_a_tenth_of_a_pixel(
     assert (refined.points0 == matches.points0).all()
 
 
-def positions(points0: np.ndarray, points1: np.ndarray, **fields: TwoViewGeometry) -> Matches:
+def positions(points0: np.ndarray, points1: np.ndarray, **fields: Any) -> Matches:
     """Return matches of keypoints that have neither sizes nor angles."""
     size, rows = (440, 400), np.arange(len(points0))
     ends = (Keypoints(points, np.ones(len(rows)), size) for points in (points0, points1))
@@ -137,3 +139,9 @@ def test_guided_matches_of_whole_pixels_become_more_exact() -> None:
     before, after = (np.linalg.norm(each.points1 - true, axis=1) for each in (matches, refined))
     assert np.mean(after < 0.5) > np.mean(before < 0.5) + 0.1
     assert np.mean(after < 1) > np.mean(before < 1) - 0.02
+
+
+def test_subpixel_matches_of_a_rectified_pair_stay_as_they_are() -> None:
+    points = np.float32([[50, 60]])
+    matches = positions(points, points, subpixel=True)
+    assert refine_matches(camera(), camera(), matches) is matches

@@ -79,8 +79,8 @@ def match(
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
     estimated geometry and its inliers, and a visualisation. The options --descriptor, --matcher,
-    --filter-by, --ratio and --refine are for --unguided. The exit code is 3 if nothing matches, or
-    if no geometry between the images can be trusted.
+    --filter-by and --ratio are for --unguided. The exit code is 3 if nothing matches, or if no
+    geometry between the images can be trusted.
 
         deepdetect match left.jpg right.jpg
         deepdetect match page1.jpg page2.jpg --model homography --mutual
@@ -109,7 +109,6 @@ def match(
     by_descriptors = UNGUIDED.take(values)
     if not unguided:
         flags = [*by_descriptors, *(["descriptor"] if "descriptor" in values else [])]
-        flags += ["refine"] if refine else []
         for name in flags:
             raise OptionError(f"`{name}` is for --unguided: add that option, or leave `{name}` out")
     chosen, selection = chosen_detector(detector, values, options=DESCRIBED_POINTS)
@@ -140,6 +139,8 @@ def match(
                             matches = match_pair(
                                 rgb0, rgb1, chosen, selection=selection, **settings
                             )
+                            if refine and not unguided:
+                                matches = refine_matches(rgb0, rgb1, matches)
                         except ImageError as error:
                             raise ImageError(_named(error, pair)) from error
                     save_matches(matches, made["file"])
