@@ -24,11 +24,10 @@ from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from ..evaluation.options import BenchmarkOptions
 from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
 from ..evaluation.protocols.dense_points import compare_clouds as compare
-from ..evaluation.protocols.masks import LabelDetector
+from ..evaluation.protocols.masks import Evaluation, LabelDetector
+from ..evaluation.protocols.masks import evaluate as run
 from ..evaluation.protocols.stereo_matches import score_stereo_matches
 from ..evaluation.report import Table
-from ..evaluation.weights import Evaluation
-from ..evaluation.weights import evaluate as run
 from ..labels import find_label_settings
 
 

@@ -1,1 +1,1 @@
-from .weights import Evaluation as Evaluation, evaluate as evaluate
+from .protocols.masks import Evaluation as Evaluation, evaluate as evaluate
