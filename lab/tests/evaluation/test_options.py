@@ -11,12 +11,12 @@ from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.io.image import load_image
 from deepdetect_lab.evaluation.baselines.method import with_common_descriptor
 from deepdetect_lab.evaluation.baselines.opencv import CLASSICAL, STANDARD
+from deepdetect_lab.evaluation.masks import LabelDetector
 from deepdetect_lab.evaluation.options import (
     BASELINES,
     PAPER_RESOLUTION_PX,
     BenchmarkOptions,
 )
-from deepdetect_lab.evaluation.protocols.masks import LabelDetector
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect_lab.datasets.planar import OXFORD_KINDS, load_oxford
 from deepdetect_lab.evaluation.baselines.method import deepdetect_feature
+from deepdetect_lab.evaluation.masks import LabelDetector, evaluate
 from deepdetect_lab.evaluation.options import PAPER_RESOLUTION_PX, THRESHOLDS
-from deepdetect_lab.evaluation.protocols.masks import LabelDetector, evaluate
 from deepdetect_lab.evaluation.protocols.paper import correct_matches
 from deepdetect_lab.evaluation.run import Run
 from deepdetect_lab.evaluation.unguided import match_unguided

@@ -21,11 +21,11 @@ from ..datasets.middlebury import load_middlebury
 from ..evaluation.acceptance.measure import FAMILIES, NOTE, guided, measure, summary
 from ..evaluation.baselines.external import find_feature, imported
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
+from ..evaluation.masks import Evaluation, LabelDetector
+from ..evaluation.masks import evaluate as run
 from ..evaluation.options import BenchmarkOptions
 from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
 from ..evaluation.protocols.dense_points import compare_clouds as compare
-from ..evaluation.protocols.masks import Evaluation, LabelDetector
-from ..evaluation.protocols.masks import evaluate as run
 from ..evaluation.protocols.stereo_matches import score_stereo_matches
 from ..evaluation.report import Table
 from ..labels import find_label_settings

@@ -1,1 +1,1 @@
-from .protocols.masks import Evaluation as Evaluation, evaluate as evaluate
+from .masks import Evaluation as Evaluation, evaluate as evaluate

@@ -24,7 +24,7 @@ from .baselines.method import (
 )
 from .baselines.opencv import CLASSICAL, STANDARD
 from .baselines.random import all_pixels_feature, random_feature
-from .protocols.masks import LabelDensityDetector
+from .masks import LabelDensityDetector
 
 PROTOCOLS = ("paper", "standard", "guided", "degraded")
 DEFAULT_PROTOCOLS = PROTOCOLS[:3]

@@ -20,7 +20,7 @@ from deepdetect._shared.machine import disable_malloc_trim
 from deepdetect._shared.options import look_up
 from deepdetect.io.image import luma
 
-from ..evaluation.protocols.masks import score_heatmap
+from ..evaluation.masks import score_heatmap
 from ..labels import visibility_of
 from ..networks.export import export_onnx
 from ..networks.weights import (

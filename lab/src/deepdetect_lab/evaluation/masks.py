@@ -18,8 +18,8 @@ from deepdetect.detector.heatmap import HeatmapOptions, compute_maps
 from deepdetect.io.image import MINIMUM_SIDE, find_images, load_image, luma
 from deepdetect.io.masks import load_mask
 
-from ...datasets.scaling import scale_short_side
-from ...labels import LabelOptions, fuse, visibility_of
+from ..datasets.scaling import scale_short_side
+from ..labels import LabelOptions, fuse, visibility_of
 
 EPSILON = 1e-7
 """Probabilities are clipped to this distance from 0 and 1, because log(0) is infinite."""
