@@ -107,8 +107,8 @@ class Teachers:
     `descriptors` (1, 64, H/4, W/4). `aliked` is the authors' file of weights.
     """
 
-    def __init__(self, edgepoint: Path, aliked: Path, threads: int = 1) -> None:
-        self.edgepoint, self.aliked = start_session(str(edgepoint), threads), load_aliked(aliked)
+    def __init__(self, edgepoint: Path, aliked: Path) -> None:
+        self.edgepoint, self.aliked = start_session(str(edgepoint), 1), load_aliked(aliked)
 
     def read(self, rgb: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return codes (N, 192) and scores (N,), float32, at points of (H, W, 3) uint8 RGB."""
@@ -142,11 +142,11 @@ def choose_points(gray: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarra
     return candidates.xy[rows], SIZE_PER_SIGMA * candidates.sigma_px[rows]
 
 
-def read_photograph(teachers: Teachers, image: object, seed: int = 0) -> Reading:
+def read_photograph(teachers: Teachers, image: object) -> Reading:
     """Run the teachers at keypoints of a photograph in any form that `load_image` accepts."""
     rgb = load_image(image)
     gray = luma(rgb)
-    xy, sizes = choose_points(gray, np.random.default_rng(seed))
+    xy, sizes = choose_points(gray, np.random.default_rng(0))
     codes, scores = teachers.read(rgb, xy)
     xy, sizes = xy.astype(np.float32), sizes.astype(np.float32)
     return Reading(gray, xy, sizes, codes.astype(np.float16), scores.astype(np.float16))
