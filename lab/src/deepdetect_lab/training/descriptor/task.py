@@ -170,9 +170,9 @@ class DescriptorTrainer(Trainer):
         """Return a dataset of batches, indexed by the items of `pairs_to_draw`."""
         return PairDataset(self.files, self.options)
 
-    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches for steps `first` to `last` - 1."""
-        to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
+    def loader(self, first: int = 0) -> DataLoader[Any]:
+        """Return a loader of the batches from step `first` on."""
+        to_draw = pairs_to_draw(self.options, first, self.steps)
         return DataLoader(
             self.dataset(),
             batch_size=None,
