@@ -197,29 +197,6 @@ def one_line() -> Callable[[BaseException], str]:
     return check
 
 
-@pytest.fixture
-def run_evaluate(tmp_path: Path) -> Callable[..., str]:
-    """Run `deepdetect dev evaluate` on one sample and return what it prints."""
-    from PIL import Image
-    from tests.command_line import run_command
-
-    from deepdetect.detector.pretrained import pretrained_weights
-
-    generator = np.random.default_rng(0)
-    Image.fromarray(generator.integers(0, 256, (64, 64, 3), np.uint8)).save(
-        tmp_path / "image_1.png"
-    )
-    Image.fromarray(generator.random((64, 64)) > 0.5).save(tmp_path / "mask_image_1.png")
-
-    def run(*arguments: object) -> str:
-        given = [pretrained_weights() if str(a).endswith(".onnx") else a for a in arguments]
-        result = run_command(["dev", "evaluate", str(tmp_path), *map(str, given)])
-        assert result.exit_code == 0, result.output
-        return result.stdout
-
-    return run
-
-
 @pytest.fixture(scope="session")
 def waves() -> Callable[[float, float], np.ndarray]:
     """Images (320, 320) uint8 of a sum of waves, exact wherever they are moved by (x, y) pixels."""

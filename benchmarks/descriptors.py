@@ -205,7 +205,7 @@ def _pose_errors(
 
 def errors_in_orders(found: Matches, pair: PosedPair) -> list[float]:
     """Return the pose error for each order of the matches."""
-    cameras = pair.first.intrinsics, pair.second.intrinsics
+    cameras = pair.first.camera.matrix, pair.second.camera.matrix
     errors = []
     for order in range(ORDERS):
         rows = np.random.default_rng(order).permutation(len(found))

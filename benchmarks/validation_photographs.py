@@ -17,7 +17,7 @@ from pathlib import Path
 from deepdetect import DeepDetect
 from deepdetect._shared.machine import processor_count
 from deepdetect.io.image import load_image
-from deepdetect_lab.evaluation.protocols.masks import Measured, mean_score, measure_heatmap
+from deepdetect_lab.evaluation.masks import Measured, mean_score, measure_heatmap
 from deepdetect_lab.labels import LabelOptions
 from deepdetect_lab.training.recipe import Stage, TrainingOptions
 from deepdetect_lab.training.views import SourceImage, label_view, list_images, render

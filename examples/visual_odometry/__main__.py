@@ -25,7 +25,6 @@ from matplotlib.figure import Figure
 from odometry import VisualOdometry
 
 from deepdetect import (
-    Camera,
     DeepDetectError,
     Keypoints,
     PointDetector,
@@ -163,9 +162,6 @@ def compare(arguments: argparse.Namespace) -> None:
     turns = [image.rotation.T for image in images]
     centres = [-turn @ i.translation for turn, i in zip(turns, images, strict=True)]
     truth = np.dstack([turns, centres])
-    matrix = images[0].intrinsics
-    height, width = load_image(images[0].path).shape[:2]
-    camera = Camera((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
     arguments.output.mkdir(parents=True, exist_ok=True)
     numbers, shown = {}, {}
     print(f"{len(images)} frames\n{'method and frames':30} {HEADER}")
@@ -178,7 +174,7 @@ def compare(arguments: argparse.Namespace) -> None:
     whole: dict[str, list[list[float]]] = {}
     for (method, count), tracker in methods.items():
         name = f"{method}, {count}"
-        odometry = VisualOdometry(camera)
+        odometry = VisualOdometry(images[0].camera)
         begun = time.process_time()
         for image in images:
             odometry.update(tracker.update(load_image(image.path)))

@@ -127,7 +127,7 @@ def test_the_same_cameras_in_each_layout(layout: str, tmp_path: Path) -> None:
     assert scene.name == "scene"
     assert [image.path.stem[-4:] for image in scene.images] == ["0000", "0001", "0002"]
     for number, image in enumerate(scene.images):
-        np.testing.assert_allclose(image.intrinsics, INTRINSICS, atol=1e-6)
+        np.testing.assert_allclose(image.camera.matrix, INTRINSICS, atol=1e-6)
         np.testing.assert_allclose(image.rotation, axes(number).T, atol=1e-6)
         # The centre of a camera lies at its own origin.
         own = image.rotation @ CENTRES[number] + image.translation
@@ -147,7 +147,7 @@ def test_projected_points_lie_on_epipolar_lines(layout: str, tmp_path: Path) -> 
             seen.append(local)
         np.testing.assert_allclose(seen[1], seen[0] @ pair.rotation.T + pair.translation, atol=1e-9)
         first, second = (
-            points @ image.intrinsics.T / points[:, 2:]
+            points @ image.camera.matrix.T / points[:, 2:]
             for points, image in zip(seen, (pair.first, pair.second), strict=True)
         )
         algebraic = np.einsum("ni,ij,nj->n", second, pair.fundamental, first)
@@ -158,13 +158,13 @@ def test_projected_points_lie_on_epipolar_lines(layout: str, tmp_path: Path) -> 
 def test_intrinsics_are_scaled_to_the_image_by_pixels_as_areas(tmp_path: Path) -> None:
     """The left edge, at -0.5, stays there; the principal point is at the same part of the width."""
     scene = load(write_strecha(tmp_path, scale=2))
-    np.testing.assert_allclose(scene.images[1].intrinsics, INTRINSICS, atol=1e-6)
+    np.testing.assert_allclose(scene.images[1].camera.matrix, INTRINSICS, atol=1e-6)
     first, second = (load(write_strecha(tmp_path / name)) for name in ("a", "b"))
     write_images(tmp_path / "b", "{:04d}.png", (30, 20))
-    half = load(tmp_path / "b").images[0].intrinsics
+    half = load(tmp_path / "b").images[0].camera.matrix
     np.testing.assert_allclose(half[:2, :2], INTRINSICS[:2, :2] / 2)
     np.testing.assert_allclose(half[:2, 2], [15.375, 9.0])  # (31.25 + .5) / 2 - .5
-    np.testing.assert_array_equal(first.images[0].intrinsics, second.images[0].intrinsics)
+    np.testing.assert_array_equal(first.images[0].camera.matrix, second.images[0].camera.matrix)
 
 
 def test_kitti_poses_belong_to_numbers_not_to_the_order(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_a_simple_pinhole_has_one_focal_length(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path, ".", ".")
     (folder / "cameras.txt").write_text("7 SIMPLE_PINHOLE 120 80 100 60.5 40.5\n")
     expected = [[50, 0, 29.75], [0, 50, 19.75], [0, 0, 1]]  # 60.5 / 2 - .5
-    np.testing.assert_allclose(load(folder).images[0].intrinsics, expected)
+    np.testing.assert_allclose(load(folder).images[0].camera.matrix, expected)
 
 
 SIMPLE, DOUBLE = "50 30.5 20.5", "50 52 31.75 19"
@@ -220,7 +220,7 @@ def test_lens_models_without_distortion_are_pinholes(case: str, tmp_path: Path) 
     simple = numbers.startswith(SIMPLE)
     fy, cx, cy = (50, 30.0, 20.0) if simple else (52, 31.25, 18.5)
     expected = [[50, 0, cx], [0, fy, cy], [0, 0, 1]]
-    np.testing.assert_allclose(load(folder).images[0].intrinsics, expected)
+    np.testing.assert_allclose(load(folder).images[0].camera.matrix, expected)
 
 
 @pytest.mark.parametrize("model", NO_PINHOLES)
@@ -305,7 +305,7 @@ def test_the_shared_scenes_are_read(shared: Path, monkeypatch: pytest.MonkeyPatc
     fountain, clip = (load(shared / "data" / name) for name in ("fountain", "kitti-clip"))
     assert (len(fountain.images), len(fountain.pairs)) == (11, 55)
     expected = [[1379.74, 0, 760.095], [0, 1382.08, 503.155], [0, 0, 1]]
-    np.testing.assert_allclose(fountain.images[0].intrinsics, expected, atol=1e-9)
+    np.testing.assert_allclose(fountain.images[0].camera.matrix, expected, atol=1e-9)
     # The photographer held it upright: y, down, is the world's z.
     assert all(image.rotation[1, 2] > 0.99 for image in fountain.images)
     assert (len(clip.images), len(clip.pairs)) == (51, 60)

@@ -21,7 +21,7 @@ from deepdetect_lab.evaluation.baselines.opencv import CLASSICAL
 from deepdetect_lab.evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from deepdetect_lab.evaluation.metrics import repeatability
 from deepdetect_lab.evaluation.options import DEFAULT_PROTOCOLS, BenchmarkOptions
-from deepdetect_lab.evaluation.protocols import masks
+from deepdetect_lab.evaluation.protocols import degraded
 from deepdetect_lab.evaluation.report import Report
 
 MADE = "results computed, not read from the cache"
@@ -217,10 +217,10 @@ def test_missing_data_stop_only_the_benchmark_that_needs_them(
     def lacks(run: object, options: object) -> list:
         raise ImageError("this needs photographs")
 
-    known = {"one": ("masks", "lacks"), "other": ("masks", "works")}
+    known = {"one": ("degraded", "lacks"), "other": ("degraded", "works")}
     monkeypatch.setattr(benchmarks, "BENCHMARKS", known)
-    monkeypatch.setattr(masks, "lacks", lacks, raising=False)
-    monkeypatch.setattr(masks, "works", lambda *_: [], raising=False)
+    monkeypatch.setattr(degraded, "lacks", lacks, raising=False)
+    monkeypatch.setattr(degraded, "works", lambda *_: [], raising=False)
     options = BenchmarkOptions(edge_detector, ("paper", "guided"))
     report = run_benchmarks(["one", "other"], tmp_path, options)
     notes = (

@@ -7,10 +7,16 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, OptionError
+from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.io.image import load_image
 from deepdetect_lab.evaluation.baselines.method import with_common_descriptor
 from deepdetect_lab.evaluation.baselines.opencv import CLASSICAL, STANDARD
-from deepdetect_lab.evaluation.options import BASELINES, BenchmarkOptions
+from deepdetect_lab.evaluation.masks import LabelDetector
+from deepdetect_lab.evaluation.options import (
+    BASELINES,
+    PAPER_RESOLUTION_PX,
+    BenchmarkOptions,
+)
 
 
 @pytest.fixture
@@ -71,3 +77,15 @@ def test_higher_thresholds_find_fewer_and_chance_follows_the_lowest(
     assert (len(chance), len(every)) == (counts[0], 60 * 80)
     (native,) = [f for f in options.standard_features() if f.name == "random-native-common"]
     assert len(native.detect(crop)) == len(options.deepdetect_native().detect(crop))
+
+
+def test_at_equal_density_there_are_as_many_pixels_as_the_label_marks(
+    options: BenchmarkOptions, photo: np.ndarray
+) -> None:
+    equal = dataclasses.replace(options, equal_density=True)
+    feature = equal.deepdetect_480()
+    label = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX)).heatmap(photo)
+    assert len(feature.detect(photo)) == np.count_nonzero(label > 0.5)
+    assert feature.key != options.deepdetect_480().key
+    own = [name for name in names(equal.density_features()) if name.startswith("deepdetect")]
+    assert own == [feature.name]

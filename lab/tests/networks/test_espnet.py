@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from deepdetect import DeepDetect, WeightsError
-from deepdetect_lab.evaluation.protocols.masks import load_sample, sample_images, score_samples
+from deepdetect_lab.evaluation.masks import load_sample, sample_images, score_samples
 from deepdetect_lab.networks.espnet import ESPNet, ResidualPyramid
 from deepdetect_lab.networks.export import export_onnx
 from deepdetect_lab.networks.weights import load_network, save_tensors

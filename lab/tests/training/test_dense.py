@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from deepdetect import OptionError
-from deepdetect_lab.evaluation.protocols.masks import score_heatmap
+from deepdetect_lab.evaluation.masks import score_heatmap
 from deepdetect_lab.networks.espnet import ESPNet
 from deepdetect_lab.networks.fast import FastNetwork
 from deepdetect_lab.networks.weights import NETWORKS

@@ -258,7 +258,9 @@ def test_a_dominant_plane_does_not_hide_the_depth_beside_it(
     pair = PosedPair("entry", first, second)
     errors = epipolar_errors(matches.points0, matches.points1, pair.fundamental)
     assert (errors < 3).mean() > 0.99
-    pose = estimate_pose(matches.points0, matches.points1, first.intrinsics, second.intrinsics)
+    pose = estimate_pose(
+        matches.points0, matches.points1, first.camera.matrix, second.camera.matrix
+    )
     assert pose is not None
     assert translation_error(pose[1], pair.translation) < 1
 

@@ -19,30 +19,19 @@ from deepdetect.detector.pretrained import PRETRAINED
 from ..datasets import StereoPair
 from ..datasets.middlebury import load_middlebury
 from ..evaluation.acceptance.measure import FAMILIES, NOTE, guided, measure, summary
-from ..evaluation.acceptance.sensitivity import NOTE as SENSITIVITY_NOTE
-from ..evaluation.acceptance.sensitivity import sensitivity as measure_sensitivity
-from ..evaluation.acceptance.sensitivity import table as sensitivity_table
 from ..evaluation.baselines.external import find_feature, imported
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
+from ..evaluation.masks import Evaluation, LabelDetector
+from ..evaluation.masks import evaluate as run
 from ..evaluation.options import BenchmarkOptions
 from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
 from ..evaluation.protocols.dense_points import compare_clouds as compare
-from ..evaluation.protocols.masks import LabelDetector
 from ..evaluation.protocols.stereo_matches import score_stereo_matches
 from ..evaluation.report import Table
-from ..evaluation.weights import Evaluation
-from ..evaluation.weights import evaluate as run
 from ..labels import find_label_settings
 
-MEASURES = cli.From(
-    run,
-    "oxford foreground equal_density",
-    more="",
-    types={"oxford": Path | None, "foreground": Path | None},
-)
 
-
-@cli.command(MEASURES, NETWORK)
+@cli.command(NETWORK)
 def evaluate(
     samples: Annotated[
         Path,
@@ -59,38 +48,30 @@ def evaluate(
     Prints, separately for images of normal and of low visibility: the mean binary cross-entropy
     (BCE) and intersection over union (IoU), the expected calibration error over all pixels, the
     fraction of pixels that are keypoints (probability above 0.5), and the fraction that the masks
-    mark. With --oxford it also prints the scores of the paper's protocol. Unreadable files are
-    listed at the end and are not in the scores.
+    mark. Unreadable files are listed at the end and are not in the scores.
 
         deepdetect dev evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
         deepdetect dev evaluate photos/ --scale 0.5 --scale 1 --scale 2
-        deepdetect dev evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
 
     Args:
         compare: Further weights to evaluate, shown next to those of --weights; may be repeated.
         scale: Also score the images scaled by this factor, against labels that are made from the
             scaled images; may be repeated. The images then need no masks.
     """
-    measures = MEASURES.take(values)
-    measures |= {"samples": samples, "scales": tuple(scale or ()), "quiet": False}
     weights = [values.pop("weights", "default"), *(compare or ())]
     detectors = [DeepDetect(path, **values) for path in weights]
-    found = [run(detector, **measures) for detector in detectors]
+    found = [run(samples, each, scales=tuple(scale or ()), quiet=False) for each in detectors]
     columns = [
         {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
         for detector, evaluation in zip(detectors, found, strict=True)
     ]
     report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
-    scores: list[Any] = [found[0], *(each.oxford for each in found)]
-    scores += [each.foreground for each in found]
     by_scale = [
         {f"x{row['scale']:g} {row['visibility']}": row for row in column.get("scales", ())}
         for column in columns
     ]
     text = cli.table(*({**c, "scales": s} for c, s in zip(columns, by_scale, strict=True)))
-    failures = [failure for score in scores if score is not None for failure in score.failures]
-    # A failure that is the same for several weights is listed once.
-    return cli.Result(report, text, list(dict.fromkeys(failures)), what="parts")
+    return cli.Result(report, text, list(found[0].failures), what="parts")
 
 
 def _values(evaluation: Evaluation) -> dict[str, Any]:
@@ -100,9 +81,6 @@ def _values(evaluation: Evaluation) -> dict[str, Any]:
             {"scale": scale, "visibility": visibility, **asdict(score)}
             for (scale, visibility), score in evaluation.scales.items()
         ]
-    for name in ("oxford", "foreground"):
-        if (score := getattr(evaluation, name)) is not None:
-            values[name] = asdict(score)
     return values
 
 
@@ -213,39 +191,7 @@ def acceptance(
     return cli.Result(table.values(), f"{table.to_markdown()}\n\n{NOTE}")
 
 
-@cli.command()
-def sensitivity(
-    data: Annotated[Path, Parameter(help="Folder of the data sets.")],
-    /,
-    *,
-    family: list[str] | None = None,
-    every: int = 10,
-    output: cli.Output = Path("sensitivity"),
-) -> cli.Result:
-    """Multiply each constant of guided matching by 0.7 and 1.4, and count answers that change.
-
-    Writes a file of answers for each change, and sensitivity.csv. A second run only computes
-    missing answers.
-
-        deepdetect dev sensitivity data --family oxford --family posed -o sensitivity
-
-    Args:
-        family: A family of pairs to match; may be repeated. [default: all]
-        every: Match only every Nth pair of a family.
-        output: Folder for the files.
-    """
-    folder = cli.output_folder(output)
-    for each in family or ():
-        look_up("family", each, FAMILIES)
-    families = family or tuple(FAMILIES)
-    rows = measure_sensitivity(data, folder, families=families, every=every, quiet=False)
-    found = sensitivity_table(rows)
-    with atomic_path(folder / "sensitivity.csv") as path:
-        path.write_text(found.to_csv())
-    return cli.Result(rows, f"{found.to_markdown()}\n\n{SENSITIVITY_NOTE}")
-
-
-OPTIONS = cli.From(BenchmarkOptions, "max_pairs max_images", more="ranker")
+OPTIONS = cli.From(BenchmarkOptions, "max_pairs max_images equal_density", more="ranker")
 
 
 @cli.command(OPTIONS, NETWORK)

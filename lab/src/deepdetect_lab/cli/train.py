@@ -26,7 +26,6 @@ from ..training import (
     PointsTrainingOptions,
     Stage,
     TrainingOptions,
-    profile,
     write_shards,
 )
 from ..training import train as train_network
@@ -133,7 +132,6 @@ def train(
     /,
     *,
     output: cli.Output,
-    profiling: Annotated[bool, Parameter("--profile", negative="")] = False,
     **values: Any,
 ) -> cli.Result:
     """Train the network on the images, or the shards, in a folder.
@@ -147,16 +145,12 @@ def train(
 
     Args:
         output: Folder of the run.
-        profiling: Only time 30 steps of each stage, and report what limits the speed.
     """
     run = RUN.take(values)
     if given := run.pop("init_weights", None):
         run["init_weights"] = given[0] if len(given) == 1 else tuple(given)
     run |= {"device": DeviceOptions(**DEVICE.take(values)), "log": cli.say}
     recipe = chosen_recipe(**values)
-    if profiling:
-        profiles = profile(images, output, recipe, **run)
-        return cli.Result(profiles, "\n".join(map(cli.table, profiles)))
     result = train_network(images, output, recipe, **run)
     best = result.best
     return cli.Result(

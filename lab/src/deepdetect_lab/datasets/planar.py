@@ -30,12 +30,6 @@ OXFORD_LAYOUT = (
     f"the data set has the scenes {', '.join(OXFORD_KINDS)} with img1 to img6 and H1to2p to H1to6p"
 )
 
-NOT_IN_D2NET_SUBSET = {
-    *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
-    *("v_artisans", "v_astronautis", "v_talent"),
-}
-"""HPatches scenes with images above 1600x1200, which most papers, such as D2-Net's, leave out."""
-
 
 @dataclass(frozen=True, eq=False)
 class PlanarPair:

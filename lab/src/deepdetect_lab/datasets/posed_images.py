@@ -22,10 +22,11 @@ import numpy as np
 
 from deepdetect._shared.errors import ImageError, first_line
 from deepdetect._shared.opencv import import_pycolmap
-from deepdetect.geometry.camera import cross_matrix
+from deepdetect.geometry.camera import Calibration, Camera, PosedView, fundamental_matrix
 from deepdetect.io.gps import read_gps
 from deepdetect.io.image import UPRIGHT, orientation_of
 from deepdetect.io.image_file import open_image
+from deepdetect.sfm.georeference import Origin
 
 from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 
@@ -41,20 +42,10 @@ COLMAP_FILES = ("images.bin", "images.txt")
 
 
 @dataclass(frozen=True, eq=False)
-class PosedImage:
-    """An image and its camera. The centre of the first pixel is (0, 0).
-
-    Attributes:
-        path: the image's file.
-        intrinsics: (3, 3) float64 camera matrix in pixels of this file.
-        rotation, translation: (3, 3) and (3,) float64, world to camera: X_camera = rotation @
-            X_world + translation, in the scene's unit of length.
-    """
+class PosedImage(PosedView):
+    """An image file and its camera. `name` is the file's name; lengths are in the scene's unit."""
 
     path: Path
-    intrinsics: np.ndarray
-    rotation: np.ndarray
-    translation: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +69,18 @@ class PosedPair:
     @property
     def rotation(self) -> np.ndarray:
         """The (3, 3) relative rotation: X_second = rotation @ X_first + translation."""
-        return self.second.rotation @ self.first.rotation.T
+        return self.second.relative_to(self.first).rotation
 
     @property
     def translation(self) -> np.ndarray:
         """The (3,) relative translation, in the scene's unit of length."""
-        return self.second.translation - self.rotation @ self.first.translation
+        return self.second.relative_to(self.first).translation
 
     @property
     def fundamental(self) -> np.ndarray:
         """The (3, 3) fundamental matrix F: x1^T F x0 = 0 for pixels x0 (first) and x1 (second)."""
-        essential = cross_matrix(self.translation) @ self.rotation
-        inverses = [np.linalg.inv(image.intrinsics) for image in (self.first, self.second)]
-        return inverses[1].T @ essential @ inverses[0]
+        cameras = Calibration(self.first.camera, self.second.camera)
+        return fundamental_matrix(cameras, self.rotation, self.translation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +91,8 @@ class PosedScene:
         name: name of the folder.
         images: all images, sorted by name.
         pairs: the chosen pairs.
-        located_only: whether only camera positions are known, in metres, from GPS. Then intrinsics
-            and rotations are meaningless, and there are no pairs.
+        located_only: whether only camera positions are known, in metres, from GPS. Then cameras and
+            rotations are meaningless, and there are no pairs.
     """
 
     name: str
@@ -187,9 +177,9 @@ def _read_strecha(folder: Path) -> list[PosedImage]:
         found = [path for end in ("", *SUFFIXES) if (path := Path(f"{stem}{end}")).is_file()]
         if not found:
             raise ImageError(f"there is no image {stem}.jpg or .png for {file}: put it there")
-        intrinsics = _scaled(numbers[:9].reshape(3, 3), size, found[0], file)
         axes, centre = numbers[12:21].reshape(3, 3), numbers[21:24]
-        images.append(_posed_image(found[0], intrinsics, axes.T, -axes.T @ centre, file))
+        pose = axes.T, -axes.T @ centre
+        images.append(_posed_image(found[0], numbers[:9].reshape(3, 3), *pose, file, size))
     return images
 
 
@@ -222,10 +212,9 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
         pose = _numbers(lines[frame].split(), 12, where).reshape(3, 4)
         axes, centre = pose[:, :3], pose[:, 3]
         image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
-        _image_size(path)  # raises an error if the image is damaged or has an EXIF rotation
         # The poses are those of KITTI's first camera, but another camera may have taken the images.
         # The last column of the projection matrix gives the offset between these cameras.
-        offset = np.linalg.solve(image.intrinsics, projection[:, 3])
+        offset = np.linalg.solve(projection[:, :3], projection[:, 3])
         images.append(replace(image, translation=image.translation + offset))
     return images
 
@@ -264,9 +253,9 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
             )
         # In COLMAP, the centre of the first pixel is (0.5, 0.5).
         matrix = camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-        matrix = _scaled(matrix, (camera.width, camera.height), paths[0], place)
-        rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
-        images.append(_posed_image(paths[0], matrix, rotation, translation, place))
+        moved = pose.rotation.matrix(), np.array(pose.translation)
+        size = (camera.width, camera.height)
+        images.append(_posed_image(paths[0], matrix, *moved, place, size))
     return sorted(images, key=lambda image: image.path)
 
 
@@ -285,12 +274,10 @@ def _read_located(folder: Path) -> list[PosedImage]:
     paths = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
     fixes = [(path, fix) for path in paths if (fix := read_gps(path)) is not None]
     places = np.nan_to_num([(fix.latitude, fix.longitude, fix.altitude) for _, fix in fixes])
-    pycolmap = import_pycolmap("GPS positions")
-    ellipsoid = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-    metres = np.asarray(ellipsoid.ellipsoid_to_enu(places, *places[0]))
-    nothing = np.eye(3)
+    metres = Origin(*places[0]).to_enu(places)
+    unknown = Camera((1, 1), 1), np.eye(3)
     return [
-        PosedImage(path, nothing, nothing, -place)
+        PosedImage(path.name, *unknown, -place, path)
         for (path, _), place in zip(fixes, metres, strict=True)
     ]
 
@@ -301,35 +288,32 @@ def _posed_image(
     rotation: np.ndarray,
     translation: np.ndarray,
     where: str | Path,
+    size: tuple[float, float] | None = None,
 ) -> PosedImage:
-    """Check the camera of an image, and return the image with its camera."""
+    """Check the camera of an image, and return the image with its camera.
+
+    The camera matrix is given for an image of `size` (width, height). None: that of the file.
+    """
     wrong = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if wrong > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
         raise ImageError(f"{where} has no valid rotation matrix: its columns must be orthonormal")
-    lower = [intrinsics[1, 0], intrinsics[2, 0], intrinsics[2, 1], intrinsics[2, 2] - 1]
-    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or np.any(lower):
+    own = _image_size(path)
+    size = size or own
+    if min(size) < 1 or abs(own[0] * size[1] / (own[1] * size[0]) - 1) > MAX_ASPECT_ERROR:
         raise ImageError(
-            f"the camera matrix of {path.name} must have zeros below its diagonal, focal lengths "
-            f"above 0 and the last row 0 0 1: correct the camera that belongs to {where}"
-        )
-    return PosedImage(path, intrinsics, rotation, translation)
-
-
-def _scaled(
-    intrinsics: np.ndarray, size: tuple[float, float], image: Path, file: Path
-) -> np.ndarray:
-    """Scale intrinsics given for an image of `size` (width, height) to the size of an image file.
-
-    The outer borders of the two images are aligned, not the centres of their first pixels.
-    """
-    own = _image_size(image)
-    if min(size) <= 0 or abs(own[0] * size[1] / (own[1] * size[0]) - 1) > MAX_ASPECT_ERROR:
-        raise ImageError(
-            f"{image} is {own[0]}x{own[1]} pixels, but {file} is for {size[0]:g}x{size[1]:g}: take "
+            f"{path} is {own[0]}x{own[1]} pixels, but {where} is for {size[0]:g}x{size[1]:g}: take "
             "images of the same aspect ratio"
         )
-    x, y = (mine / its for mine, its in zip(own, size, strict=True))
-    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]]) @ intrinsics
+    focal, centre = np.diag(intrinsics)[:2], intrinsics[:2, 2]
+    expected = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
+    if focal.min() <= 0 or np.any(intrinsics != expected):
+        raise ImageError(
+            f"the camera matrix of {path.name} must have the rows fx 0 cx, 0 fy cy and 0 0 1, with "
+            f"focal lengths above 0: correct the camera that belongs to {where}"
+        )
+    camera = Camera(size, focal.tolist(), centre.tolist())
+    camera = camera if camera.size == own else camera.scaled(own)
+    return PosedImage(path.name, camera, rotation, translation, path)
 
 
 def _image_size(path: Path) -> tuple[int, int]:

@@ -1,1 +1,1 @@
-from .weights import Evaluation as Evaluation, evaluate as evaluate
+from .masks import Evaluation as Evaluation, evaluate as evaluate

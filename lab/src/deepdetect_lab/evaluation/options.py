@@ -24,6 +24,7 @@ from .baselines.method import (
 )
 from .baselines.opencv import CLASSICAL, STANDARD
 from .baselines.random import all_pixels_feature, random_feature
+from .masks import LabelDensityDetector
 
 PROTOCOLS = ("paper", "standard", "guided", "degraded")
 DEFAULT_PROTOCOLS = PROTOCOLS[:3]
@@ -52,6 +53,9 @@ class BenchmarkOptions:
             are taken. If it is 1, a scene with homographies gives its last pair.
         max_images: largest number of images per scene in structure from motion. If a scene has
             more, the first images of a sequence or evenly spaced other images are taken.
+        equal_density: in the paper's protocol, take DeepDetect's N most probable pixels instead of
+            all over 0.5. N is the number of pixels that the image's fusion label marks. Otherwise
+            weights that mark more would score higher.
         ranker: npz file written by `deepdetect dev train-points`, with the network that ranks
             multi-scale keypoints. None: the bundled file.
 
@@ -67,6 +71,7 @@ class BenchmarkOptions:
     geometry_weights: tuple[str | Path, ...] = ("dense",)
     max_pairs: int = 60
     max_images: int = 20
+    equal_density: bool = False
     ranker: str | Path | None = None
 
     def __post_init__(self) -> None:
@@ -83,11 +88,17 @@ class BenchmarkOptions:
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
         """Return DeepDetect as in the paper: images of 480x480, SIFT descriptors of size 3 px."""
+        detector = self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels))
+        title = f"DeepDetect, threshold {threshold:g}"
+        name = f"deepdetect-{threshold:g}"
+        feature = deepdetect_feature(detector, SelectionOptions(threshold), name=name, title=title)
+        if not self.equal_density:
+            return feature
         return deepdetect_feature(
-            self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)),
-            SelectionOptions(threshold),
-            name=f"deepdetect-{threshold:g}",
-            title=f"DeepDetect, threshold {threshold:g}",
+            LabelDensityDetector(detector),
+            name="deepdetect-equal-density",
+            title="DeepDetect, as many pixels as the label",
+            version=feature.version,
         )
 
     def native_detector(self) -> DeepDetect:
@@ -106,7 +117,8 @@ class BenchmarkOptions:
     def density_features(self) -> list[LocalFeature]:
         """Return the features to compare by density (Table I of the paper) and by repeatability."""
         classical = [CLASSICAL[name] for name in self.classical if name in CLASSICAL]
-        own = [self.deepdetect_480(threshold) for threshold in THRESHOLDS]
+        thresholds = THRESHOLDS[:1] if self.equal_density else THRESHOLDS
+        own = [self.deepdetect_480(threshold) for threshold in thresholds]
         return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
 
     def matching_features(self) -> list[LocalFeature]:

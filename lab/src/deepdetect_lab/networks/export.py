@@ -45,8 +45,7 @@ def to_onnx(
 ) -> onnx.ModelProto:
     """Convert a network to ONNX by tracing it with example `inputs`, which are given by name.
 
-    `output` names the output, or several outputs separated by blanks.
-    `axes` maps each input or output to the names of its axes of variable size, by axis number.
+    `axes` maps each input and the `output` to the names of its axes of variable size, by number.
     """
     written = io.BytesIO()
     with warnings.catch_warnings():
@@ -57,7 +56,7 @@ def to_onnx(
             tuple(inputs.values()),
             written,  # type: ignore[arg-type]  # annotated for the other exporter
             input_names=list(inputs),
-            output_names=output.split(),
+            output_names=[output],
             dynamic_axes=axes,
             opset_version=OPSET,
             dynamo=False,

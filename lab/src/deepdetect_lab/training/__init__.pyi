@@ -9,7 +9,6 @@ from .recipe import (
     TrainingOptions as TrainingOptions,
 )
 from .run import (
-    profile as profile,
     train as train,
     train_on_pairs as train_on_pairs,
 )

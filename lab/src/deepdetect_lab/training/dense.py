@@ -20,7 +20,7 @@ from deepdetect._shared.machine import disable_malloc_trim
 from deepdetect._shared.options import look_up
 from deepdetect.io.image import luma
 
-from ..evaluation.protocols.masks import score_heatmap
+from ..evaluation.masks import score_heatmap
 from ..labels import visibility_of
 from ..networks.export import export_onnx
 from ..networks.weights import (
@@ -152,18 +152,14 @@ class DenseTrainer(Trainer):
             self._forward = self._set_up()
             return self.logits(images)
 
-    def device_memory_bytes(self) -> int:
-        """Return the peak memory that torch has used on the GPU, in bytes; 0 on the CPU."""
-        return torch.cuda.max_memory_allocated() if self.device.type == "cuda" else 0
-
     def describe(self) -> str:
         """Describe, for the log, the device, the precision and whether the network is compiled."""
         precision = "bfloat16" if self.bfloat16 else "float32"
         return f"{self.device.type}, {precision}, {'compiled' if self.compiled else 'eager'}"
 
-    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches (images, labels) for steps `first` to `last` - 1."""
-        sampler = CropSampler(self.schedule, self.data.training.shard_sizes, first, last)
+    def loader(self, first: int = 0) -> DataLoader[Any]:
+        """Return a loader of the batches (images, labels) from step `first` on."""
+        sampler = CropSampler(self.schedule, self.data.training.shard_sizes, first)
         return self._loader(CropDataset(self.data.training, self.options), batch_sampler=sampler)
 
     def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:

@@ -306,10 +306,9 @@ class MatchFilterTrainer(Trainer):
         self.origin = digests(images, validation)
         self.notes = {"images": str(len(images))}
 
-    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches for steps `first` to `last` - 1, as returned by `join`."""
-        steps = range(first, self.steps if last is None else last)
-        dataset = BatchDataset(self.samples, self.options)
+    def loader(self, first: int = 0) -> DataLoader[Any]:
+        """Return a loader of the batches from step `first` on, as returned by `join`."""
+        steps, dataset = range(first, self.steps), BatchDataset(self.samples, self.options)
         return DataLoader(dataset, batch_size=None, sampler=steps, generator=torch.Generator())
 
     def loss(self, batch: tuple[list[Tensor], Tensor]) -> Tensor:

@@ -1,19 +1,13 @@
-"""Train networks, and `profile` the speed of a run.
-
-The functions import torch only when they are called, so that other commands start faster.
-"""
+"""Train networks. The functions import torch only when called, so other commands start faster."""
 
 from __future__ import annotations
 
-import dataclasses
-import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import suggest_keywords
-from deepdetect._shared.progress import progress
 from deepdetect.io.image import find_images
 
 from .recipe import (
@@ -26,7 +20,6 @@ from .recipe import (
 )
 
 if TYPE_CHECKING:
-    from .dense import DenseTrainer
     from .trainer import Trainer, TrainingResult
 
 Log = Callable[[str], None]
@@ -81,9 +74,21 @@ def train(
         >>> result = train("photos", "run", options)  # doctest: +SKIP
         >>> detector = DeepDetect(result.onnx)  # doctest: +SKIP
     """
-    data = {"validation": validation, "labels": labels, "workers": workers}
-    trainer = _dense_trainer(images, output, options, init_weights, device, log, **data)
-    return trainer.fit(Path(output), log)
+    from .dataset import prepare_data
+    from .dense import DenseTrainer, initial_network
+
+    options, network = initial_network(options, init_weights)  # may raise, so it comes first
+    data = prepare_data(
+        images,
+        options,
+        output,
+        validation=validation,
+        labels=labels,
+        workers=workers,
+        processes=max(1, device.worker_count),
+        quiet=log is None,
+    )
+    return DenseTrainer(network, options, data, device).fit(Path(output), log)
 
 
 @suggest_keywords
@@ -166,81 +171,3 @@ def _files(
     """List training and validation images, without the figures that runs write to `output`."""
     images, validation, output = Path(images), Path(validation), Path(output)
     return find_images(images, [output, validation]), find_images(validation, [output, images])
-
-
-def _dense_trainer(
-    images: str | Path,
-    output: str | Path,
-    options: TrainingOptions,
-    init_weights: InitWeights | None = None,
-    device: DeviceOptions = DeviceOptions(),
-    log: Log | None = None,
-    **data: Any,
-) -> DenseTrainer:
-    """Make missing labels; return the trainer. `data` holds the further arguments of `train`."""
-    from .dataset import prepare_data
-    from .dense import DenseTrainer, initial_network
-
-    options, network = initial_network(options, init_weights)  # may raise, so it comes first
-    loading = max(1, device.worker_count)
-    prepared = prepare_data(images, options, output, **data, processes=loading, quiet=log is None)
-    return DenseTrainer(network, options, prepared, device)
-
-
-TIMED_STEPS, WARM_UP_STEPS = 30, 5
-"""`profile` times `TIMED_STEPS` steps of each stage. It leaves out the first `WARM_UP_STEPS` steps,
-in which the network is compiled, memory is allocated and the first views are rendered."""
-
-
-def profile(
-    images: str | Path,
-    output: str | Path,
-    options: TrainingOptions = TrainingOptions(),
-    *,
-    log: Log | None = None,
-    **how: Any,
-) -> list[dict[str, Any]]:
-    """Time some steps of each stage of a `train` run; only the label cache is written.
-
-    Returns for each stage the crops per second, the same speed in images of 480x480 pixels per
-    second, the fraction of the time spent waiting for data, and the peak memory so far (0 if
-    unknown) of the process and of the GPU, in bytes.
-    """
-    from ..evaluation.profiling import peak_memory
-    from .dataset import loading
-    from .trainer import FULL_IMAGE_PIXELS
-
-    options = dataclasses.replace(options, interleave=False)  # stages are timed separately
-    trainer = _dense_trainer(images, output, options, log=log, **how)
-    if log is not None:
-        log(f"timing {trainer.describe()}")
-    profiles, first = [], 0
-    whole = trainer.schedule.steps_of_stage
-    lengths = [min(steps, TIMED_STEPS + WARM_UP_STEPS) for steps in whole]
-    with progress(sum(lengths), "timing", "step", log is None) as bar:
-        for stage, steps, length in zip(options.stages, whole, lengths, strict=True):
-            timed_from, waited = first + min(WARM_UP_STEPS, length - 1), 0.0
-            with loading(trainer.loader(first, first + length)) as batches:
-                for step in range(first, first + length):
-                    asked = time.perf_counter()
-                    if step == timed_from:
-                        waited, started = 0.0, asked
-                    batch = next(batches)
-                    waited += time.perf_counter() - asked
-                    trainer.training_step(batch, step)  # reads the loss from the GPU, so it waits
-                    bar.update(1)
-            seconds = time.perf_counter() - started
-            timed = first + length - timed_from
-            rate = timed * stage.batch / seconds
-            row = {
-                "stage": dataclasses.asdict(stage),
-                "steps": timed,
-                "images_per_second": rate,
-                "full_images_per_second": rate * stage.crop**2 / FULL_IMAGE_PIXELS,
-                "waiting_fraction": waited / seconds,
-                "memory_bytes": peak_memory(),
-                "device_memory_bytes": trainer.device_memory_bytes(),
-            }
-            profiles.append(row)
-            first += steps
-    return profiles

@@ -87,7 +87,7 @@ class CropSampler(Sampler[list[CropIndex]]):
         schedule: the steps.
         shard_sizes: number of images in each shard, so that the crops of only a few shards are
             mixed at a time. None: the images are not in shards, and are all mixed.
-        first_step, last_step: the steps are `first_step` to `last_step` - 1; by default all steps.
+        first_step: the first of the steps, which go on to the last one.
 
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
@@ -100,11 +100,10 @@ class CropSampler(Sampler[list[CropIndex]]):
         schedule: Schedule,
         shard_sizes: Sequence[int] | None = None,
         first_step: int = 0,
-        last_step: int | None = None,
     ) -> None:
         self.schedule = schedule
         self.shard_sizes = None if shard_sizes is None else tuple(shard_sizes)
-        self.steps = range(first_step, schedule.steps if last_step is None else last_step)
+        self.steps = range(first_step, schedule.steps)
 
     def __len__(self) -> int:
         return len(self.steps)

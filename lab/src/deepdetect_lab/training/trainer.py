@@ -112,8 +112,8 @@ class Trainer(abc.ABC):
     max_gradient_norm = math.inf
 
     @abc.abstractmethod
-    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches for steps `first` to `last` - 1 (None: to the end)."""
+    def loader(self, first: int = 0) -> DataLoader[Any]:
+        """Return a loader of the batches from step `first` to the last step."""
 
     def pixels(self, batch: Any) -> int:
         """Return the number of pixels in a batch, from which the speed is computed; 0: no speed."""

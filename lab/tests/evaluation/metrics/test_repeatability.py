@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from deepdetect.geometry import transform_points
 from deepdetect_lab.evaluation.metrics.repeatability import (
-    coverage,
     foreground_fraction,
     mutual_nn_repeatability,
     repeatability_paper,
@@ -126,17 +125,6 @@ def test_points_moved_by_the_homography_are_repeated(
         assert value in (0, 1)
         assert value == 0 or localization == pytest.approx(0, abs=1e-6)
         assert 0 <= chance <= 1
-
-
-def test_coverage_counts_cells_once() -> None:
-    size = (64, 96)  # two by three cells
-    assert coverage(np.empty((0, 2)), size) == 0
-    assert coverage(np.array([[0, 0], [1, 1], [31, 31]]), size) == pytest.approx(1 / 6)
-    assert coverage(np.array([[31.6, 0]]), size) == coverage(np.array([[0, 95.4]]), size) == 1 / 6
-    # A cell begins half a pixel before its first centre; the last ones may be smaller.
-    assert coverage(np.array([[31.4, 0], [0, 0]]), (64, 32)) == 0.5
-    assert coverage(np.array([[31.5, 0], [0, 0]]), (64, 32)) == 1
-    assert coverage(np.array([[32, 0]]), (33, 10)) == 0.5
 
 
 def test_foreground_fraction() -> None:

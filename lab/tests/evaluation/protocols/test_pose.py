@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect
+from deepdetect.geometry.camera import Camera
 from deepdetect_lab.datasets.posed_images import (
     PosedImage,
     PosedPair,
@@ -95,7 +96,8 @@ def test_all_methods_find_the_pose_and_the_control_does_not(report: Report, fold
 
 @pytest.fixture
 def scene() -> PosedScene:
-    image = PosedImage(Path("0.png"), np.diag([100.0, 100, 1]), np.eye(3), np.zeros(3))
+    camera = Camera((64, 48), 100, (0, 0))
+    image = PosedImage("0.png", camera, np.eye(3), np.zeros(3), Path("0.png"))
     pairs = tuple(PosedPair("clip", image, image, distance) for distance in (1, 1, 1, 3))
     return PosedScene("clip", (image,), pairs)
 
@@ -154,7 +156,7 @@ def test_a_second_run_reads_what_the_first_has_kept(folder: Path, tmp_path: Path
     (pair,) = load_posed_scenes(folder)[0].pairs
     world = np.random.default_rng(0).uniform((-3, -2, 5), (3, 2, 10), (60, 3))
     seen = world, world @ pair.rotation.T + pair.translation
-    points = [(p @ pair.first.intrinsics.T / p[:, 2:])[:, :2] for p in seen]
+    points = [(p @ pair.first.camera.matrix.T / p[:, 2:])[:, :2] for p in seen]
     method = PoseMethod("made up", "Made up", lambda _: (*points, 2.5, "fundamental"))
     runs = Run(folder, tmp_path), Run(folder, tmp_path)
     once, again = (pose_row(run, method, pair) for run in runs)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, reconstruct_many
-from deepdetect.geometry.camera import PosedView
+from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm import MultiViewOptions
 from deepdetect_lab.datasets.posed_images import (
     PosedImage,
@@ -20,7 +20,7 @@ from deepdetect_lab.datasets.posed_images import (
 from deepdetect_lab.evaluation.benchmarks import run_benchmarks
 from deepdetect_lab.evaluation.options import BenchmarkOptions
 from deepdetect_lab.evaluation.protocols import sfm
-from deepdetect_lab.evaluation.protocols.sfm import camera_table, choose_images, true_views
+from deepdetect_lab.evaluation.protocols.sfm import camera_table, choose_images
 from deepdetect_lab.evaluation.run import Run
 
 POINTS, RANDOM = "DeepDetect, points", "baseline: as many random points"
@@ -44,8 +44,8 @@ def images(folder: Path, count: int) -> tuple[PosedImage, ...]:
         if not path.exists():
             cv2.imwrite(str(path), np.zeros((48, 64), np.uint8))
         rotation = cv2.Rodrigues(np.array([0.02 * number**2, 0.1 * number, 0]))[0]
-        matrix = np.array([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]])
-        found.append(PosedImage(path, matrix, rotation, np.array([0.0, 0, 10])))
+        camera = Camera((64, 48), 50)
+        found.append(PosedImage(path.name, camera, rotation, np.array([0.0, 0, 10]), path))
     return tuple(found)
 
 
@@ -59,10 +59,10 @@ def rows(scene: PosedScene) -> list:
     # Twice as large, in another frame, and one is missing.
     turn = cv2.Rodrigues(np.array([0.5, -1, 0.2]))[0]
     own = {
-        name: PosedView(
-            name, view.camera, view.rotation @ turn.T, -view.rotation @ turn.T @ (2 * turn @ c)
+        view.name: PosedView(
+            view.name, view.camera, view.rotation @ turn.T, -view.rotation @ turn.T @ (2 * turn @ c)
         )
-        for name, view in list(true_views(scene).items())[:4]
+        for view in scene.images[:4]
         for c in (view.centre,)
     }
     good = model(own, 1000, 3.5, 0.25)

@@ -14,8 +14,8 @@ from deepdetect import DeepDetect
 from deepdetect.io.image import luma
 from deepdetect_lab.datasets.middlebury import StereoPair, load_calibrated_pair, load_middlebury
 from deepdetect_lab.evaluation.baselines.opencv import self_described
+from deepdetect_lab.evaluation.masks import LabelDetector
 from deepdetect_lab.evaluation.options import BenchmarkOptions
-from deepdetect_lab.evaluation.protocols.masks import LabelDetector
 from deepdetect_lab.evaluation.protocols.stereo import (
     AS_IT_IS,
     SHIFTED,

@@ -15,13 +15,13 @@ from deepdetect_lab.training.teachers.readings import Reading, choose_points
 def made_reading(gray: np.ndarray, seed: int = 0) -> Reading:
     """Points of a picture with codes and scores at random, as if teachers had been read."""
     rng = np.random.default_rng(seed)
-    xy, sizes, places = choose_points(gray, rng)
+    xy, sizes = choose_points(gray, rng)
     codes = [rng.normal(size=(len(xy), length)) for length in (64, 128)]
     codes = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in codes]
-    scores = rng.random((len(xy), 2))
+    scores = rng.random(len(xy))
     numbers = (values.astype(np.float32) for values in (xy, sizes))
     halves = (values.astype(np.float16) for values in (np.hstack(codes), scores))
-    return Reading(gray, *numbers, places, *halves)
+    return Reading(gray, *numbers, *halves)
 
 
 @pytest.fixture(scope="session")

@@ -66,7 +66,7 @@ class Truth:
         """Return the error in degrees of the pose that the matches give; None without cameras."""
         if self.posed is None:
             return None
-        cameras = self.posed.first.intrinsics, self.posed.second.intrinsics
+        cameras = self.posed.first.camera.matrix, self.posed.second.camera.matrix
         return float(pose_errors(estimate_pose(points0, points1, *cameras), self.posed)[ERROR])
 
     def judge(self, matches: Matches) -> Answer:

@@ -11,8 +11,8 @@ from deepdetect.geometry.transforms import transfer_errors, transform_points
 
 CORNER_THRESHOLDS_PX = (1.0, 3.0, 5.0)
 
-MATCH_THRESHOLDS_PX = tuple(range(1, 11))
-"""Error thresholds of the mean matching accuracy, 1 to 10 pixels as in D2-Net's paper."""
+MATCH_THRESHOLDS_PX = (1, 3)
+"""Error thresholds at which matches are counted as correct."""
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(width, height) of each of the two images."""
@@ -52,11 +52,11 @@ def match_accuracy(
     """Evaluate the (M, 2) matches of two images by the true homography from first to second.
 
     `keypoints0` and `keypoints1` are all keypoints, (N, 2), matched or not. Errors are distances in
-    the second image. Returns the number of "matches", and three values for each threshold `px` from
-    1 to 10. ("correct", px): number of matches with an error of at most px. ("precision", px):
-    their fraction of all matches, which D2-Net calls matching accuracy. ("score", px):
-    Mikolajczyk's matching score, the number of correct matches of points that both images show,
-    divided by the smaller number of keypoints in the overlap.
+    the second image. Returns the number of "matches", and three values for each threshold `px` of
+    `MATCH_THRESHOLDS_PX`. ("correct", px): number of matches with an error of at most px.
+    ("precision", px): their fraction of all matches. ("score", px): Mikolajczyk's matching score,
+    the number of correct matches of points that both images show, divided by the smaller number of
+    keypoints in the overlap.
     """
     errors = transfer_errors(points0, points1, homography)
     back = np.linalg.inv(homography)

@@ -1,4 +1,4 @@
-"""Measure repeatability of keypoints, their coverage, and their fraction on the foreground.
+"""Measure the repeatability of keypoints, and their fraction on the foreground.
 
 There are two definitions of repeatability. In the paper's, several keypoints may share a partner
 in the other image, so a detector that marks every pixel scores best. With mutual nearest
@@ -26,9 +26,6 @@ MAX_DRAWS = 100
 """Random points are drawn at most this often; few keypoints would need thousands of draws."""
 
 MIN_POINTS_FOR_THREADS = 20_000
-
-CELL_PX = 32
-"""Side of the square cells of `coverage` in pixels. Chosen by hand."""
 
 
 def repeatability_paper(
@@ -153,14 +150,6 @@ def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.
 
     matrix = np.frombuffer(homography).reshape(3, 3)
     return _in_overlap(grid(sizes[0]), grid(sizes[1]), matrix, sizes)
-
-
-def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the fraction of the `CELL_PX` cells of a (width, height) image with a keypoint."""
-    columns, rows = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
-    position = np.floor((np.asarray(xy, np.float64).reshape(-1, 2) + 0.5) / CELL_PX).astype(int)
-    position = np.clip(position, 0, (columns - 1, rows - 1))
-    return len(np.unique(position[:, 1] * columns + position[:, 0])) / (columns * rows)
 
 
 def foreground_fraction(xy: np.ndarray, foreground: np.ndarray) -> float:

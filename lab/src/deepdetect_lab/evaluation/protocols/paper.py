@@ -50,14 +50,6 @@ CORRECT_PX = 1.0
 
 PAPER_MATCHING = MatchSettings(matcher="flann", ratio=0.99)
 
-SEEDS = 3
-"""Number of FLANN seeds to average, because the random trees change counts by some per cent."""
-
-FEW_MATCHES = 1000
-MANY_SEEDS = 64
-"""Image pairs with fewer than `FEW_MATCHES` correct matches are averaged over `MANY_SEEDS` FLANN
-seeds instead of `SEEDS`, because numbers of about 100 (graf) vary by a tenth between seeds."""
-
 REPEATABILITY_NOTE = (
     "Repeatability: number of keypoints of the first image that the true homography maps to less "
     "than 1 px from any keypoint of the second, divided by the number of keypoints in the image "
@@ -112,28 +104,20 @@ def repeatability_table(
 ) -> Table:
     """Tabulate the paper's repeatability at 1 px: the mean of each scene, and of all scenes."""
 
+    def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
+        return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
+
     def over_scenes(own: Rows) -> Cell:
         return mean_of(mean(where(own, scene=s.name), "repeatability") for s in scenes)
 
-    rows = repeatability_rows(run, features, scenes)
+    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs}
+    rows = run.rows("repeatability of ", features, pairs, measure)
     columns: Columns = {
         "mean": (".4f", over_scenes),
         **{scene.name: average(".4f", "repeatability", scene=scene.name) for scene in scenes},
     }
     title = "Repeatability as in the paper"
     return tabulate(key, title, features, rows, columns, REPEATABILITY_NOTE)
-
-
-def repeatability_rows(
-    run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene]
-) -> Rows:
-    """Measure the paper's repeatability of each pair; rows hold "repeatability" and "scene"."""
-
-    def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
-        return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
-
-    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs}
-    return run.rows("repeatability of ", features, pairs, measure)
 
 
 def matches_table(
@@ -165,7 +149,17 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Run the benchmark: the fraction of keypoints on the foreground, as in the paper's Table I."""
     images = load_foreground(run.folder("foreground"))
     features = options.density_features()
-    rows = foreground_rows(run, features, images)
+
+    def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:
+        keypoints, _ = run.keypoints(feature, image.image)
+        mask = load_mask(image.mask)
+        if mask.shape[::-1] != keypoints.image_size:
+            raise ImageError(f"the mask {image.mask.name} and its photograph differ in size")
+        fraction = foreground_fraction(keypoints.xy, mask)  # NaN without keypoints
+        return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
+
+    items = {each.image.name: each for each in images}
+    rows = run.rows("foreground of ", features, items, measure)
     for feature in features:
         own = where(rows, method=feature.name)
         if empty := sum(row["fraction"] != row["fraction"] for row in own):  # NaN
@@ -193,26 +187,6 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
     return [Section("Foreground (Table I)", (), [table])]
 
 
-def foreground_rows(
-    run: Run, features: Sequence[LocalFeature], images: Sequence[MaskedPhotograph]
-) -> Rows:
-    """Measure each feature on each photograph with a foreground mask.
-
-    Rows hold the "fraction" of keypoints on the foreground (NaN without keypoints), the "density"
-    in keypoints per pixel, and "covered", the fraction of pixels on the foreground.
-    """
-
-    def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:
-        keypoints, _ = run.keypoints(feature, image.image)
-        mask = load_mask(image.mask)
-        if mask.shape[::-1] != keypoints.image_size:
-            raise ImageError(f"the mask {image.mask.name} and its photograph differ in size")
-        fraction = foreground_fraction(keypoints.xy, mask)
-        return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
-
-    return run.rows("foreground of ", features, {each.image.name: each for each in images}, measure)
-
-
 def pair_repeatability(run: Run, feature: LocalFeature, pair: PlanarPair) -> float:
     """Return the repeatability of a feature on a pair, as the paper defines it."""
     images = (pair.first, pair.second)
@@ -225,25 +199,11 @@ def pair_repeatability(run: Run, feature: LocalFeature, pair: PlanarPair) -> flo
     return float(run.cached("repeatability_paper", depends, make)["value"])
 
 
-def correct_matches(
-    run: Run, feature: LocalFeature, pair: PlanarPair, seed: int = 0
-) -> tuple[int, int]:
-    """Return the numbers of correct matches and of all matches of a pair, for one FLANN seed."""
-    settings = MatchSettings(PAPER_MATCHING.matcher, PAPER_MATCHING.ratio, seed=seed)
-    found = run.matches(feature, (pair.first, pair.second), settings)
+def correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> tuple[int, int]:
+    """Return the numbers of correct matches and of all matches of a pair."""
+    found = run.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
     errors = transfer_errors(found.points0, found.points1, pair.homography)
     return int(np.count_nonzero(errors < CORRECT_PX)), len(errors)
-
-
-def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> tuple[int, int]:
-    """Return the numbers of correct and of all matches, as rounded means over FLANN seeds."""
-    counts: list[tuple[int, int]] = []
-    for seed in range(MANY_SEEDS):
-        if seed == SEEDS and np.mean(counts, axis=0)[0] >= FEW_MATCHES:
-            break
-        counts.append(correct_matches(run, feature, pair, seed))
-    correct, matches = np.rint(np.mean(counts, axis=0)).astype(int).tolist()
-    return correct, matches
 
 
 def keypoint_figure(run: Run, features: Sequence[LocalFeature], scene: PlanarScene) -> Figure:

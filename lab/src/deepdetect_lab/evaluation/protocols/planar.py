@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 from ...datasets.planar import (
-    NOT_IN_D2NET_SUBSET,
     OXFORD_KINDS,
     PlanarPair,
     PlanarScene,
@@ -149,19 +148,14 @@ def _drawn(
 
 
 def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the chosen protocols on HPatches; "standard" also runs on D2-Net's subset of scenes."""
+    """Run the chosen protocols on HPatches, by the homographies that the data set publishes."""
     found = load_hpatches(run.folder("hpatches"))
     scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]
     last = [scene.pairs[-1] for scene in scenes]
-    subsets = {f"all {len(scenes)} scenes": scenes}
-    subset = [scene for scene in scenes if scene.name not in NOT_IN_D2NET_SUBSET]
-    if 0 < len(subset) < len(scenes):
-        subsets[f"the {len(subset)} scenes of D2-Net"] = subset
     sections = _hpatches_paper(run, options, scenes, last)
-    for name, chosen in subsets.items():
-        key, title = f"hpatches_{len(chosen)}", f"HPatches, {name}"
-        text = "Evaluated by the homographies that the data set publishes."
-        sections += standard_sections(run, options, pairs_of(chosen), key, title, text)
+    what = f"hpatches_{len(scenes)}", f"HPatches, {len(scenes)} scenes"
+    text = "Evaluated by the homographies that the data set publishes."
+    sections += standard_sections(run, options, pairs_of(scenes), *what, text)
     sections += guided_sections(run, options, {"published": last}, "hpatches", "HPatches")
     return sections + degraded_sections(run, options, pairs_of(scenes), "hpatches", "HPatches")
 

@@ -171,7 +171,7 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
     """
     match = method.match
     images = (pair.first.path, pair.second.path)
-    cameras = (pair.first.intrinsics, pair.second.intrinsics)
+    cameras = (pair.first.camera.matrix, pair.second.camera.matrix)
 
     def make() -> Row:
         assert match is not None

@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -135,19 +135,6 @@ class SfmMethod:
     tracks: Literal["sparse", "dense"] = "sparse"
 
 
-@lru_cache
-def true_views(scene: PosedScene) -> dict[str, PosedView]:
-    """Return the true camera and pose of each image, by file name."""
-    views = {}
-    for image in scene.images:
-        name, matrix = image.path.name, image.intrinsics
-        height, width = load_image(image.path).shape[:2]
-        focal, centre = (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2])
-        camera = Camera((width, height), focal, centre)
-        views[name] = PosedView(name, camera, image.rotation, image.translation)
-    return views
-
-
 def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Run the benchmark: reconstruct each scene by each method, and measure dense points."""
     import_pycolmap()  # fails early if pycolmap is not installed
@@ -211,10 +198,10 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
     cameras by file name.
     """
     images = tuple(image.path for image in scene.images)
-    cameras = {name: view.camera for name, view in true_views(scene).items()}
+    cameras = {image.name: image.camera for image in scene.images}
     depends = (
         (method.name, method.version),
-        [(image.path, image.path.name, image.intrinsics) for image in scene.images],
+        [(image.path, image.name, image.camera.matrix) for image in scene.images],
         repr(vars(OPTIONS)),
         import_pycolmap().__version__,
     )
@@ -234,7 +221,7 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
 def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
     """Measure dense points or read the values from the cache: rows for DeepDetect and SGBM."""
     images = tuple(image.path for image in scene.images)
-    cameras = {name: view.camera for name, view in true_views(scene).items()}
+    cameras = {image.name: image.camera for image in scene.images}
     known = {} if scene.located_only else cameras
     depends = (
         ("dense and SGBM", _version(detector)),
@@ -255,7 +242,7 @@ def camera_table(rows: Rows) -> Table:
     lines = []
     for row in rows:
         scene: PosedScene = row["scene"]
-        truth = true_views(scene)
+        truth = {image.name: image for image in scene.images}
         first = next((each for each in where(rows, scene=scene, method=rows[0]["method"])), row)
         for kind in KINDS:
             if scene.located_only and kind == "true":

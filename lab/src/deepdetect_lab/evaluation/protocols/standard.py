@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,13 +15,12 @@ from ...datasets.planar import PlanarPair
 from ..baselines.method import LocalFeature
 from ..metrics.homography import (
     CORNER_THRESHOLDS_PX,
-    MATCH_THRESHOLDS_PX,
     accuracy_at,
     area_under_curve,
     corner_error,
     match_accuracy,
 )
-from ..metrics.repeatability import coverage, mutual_nn_repeatability
+from ..metrics.repeatability import mutual_nn_repeatability
 from ..options import BenchmarkOptions
 from ..report import (
     Cell,
@@ -100,12 +98,10 @@ def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
 
     Returns:
         Values by name. "kind": kind of change in the pair. ("keypoints", budget): number of
-        keypoints in the image that has fewer. ("coverage", budget): coverage of the first image.
-        ("repeated", budget, radius), ("chance", budget, radius) and ("localization", budget,
-        radius): the values of `mutual_nn_repeatability`. "matches", ("correct", px), ("precision",
-        px) and ("score", px): the values of `match_accuracy`. "all matches" and ("accuracy", px):
-        number and precision of the matches without a ratio test. "corner errors": a list with the
-        corner error for each seed of MAGSAC.
+        keypoints in the image that has fewer. ("repeated", budget, radius), ("chance", budget,
+        radius) and ("localization", budget, radius): the values of `mutual_nn_repeatability`.
+        "matches", ("correct", px), ("precision", px) and ("score", px): the values of
+        `match_accuracy`. "corner errors": a list with the corner error for each seed of MAGSAC.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0] for image in images)
@@ -113,18 +109,11 @@ def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
     ratio = math.inf if feature.learned else RATIO
     settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
     matches = run.matches(feature, images, settings)
-    unfiltered = run.matches(feature, images, replace(settings, ratio=math.inf))
-    accuracy, without_ratio = (
-        match_accuracy(
-            *(found.points0, found.points1, found.keypoints0, found.keypoints1),
-            *(pair.homography, sizes),
-        )
-        for found in (matches, unfiltered)
-    )
+    points = matches.points0, matches.points1
+    keypoints = matches.keypoints0, matches.keypoints1
 
     def corner_errors() -> Row:
         options = GeometryOptions(inlier_threshold=INLIER_THRESHOLD_PX)
-        points = matches.points0, matches.points1
         estimated = [
             estimate_geometry(*points, "homography", seed=seed, options=options).matrix
             for seed in range(SEEDS)
@@ -134,9 +123,7 @@ def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
     depends = (*feature.key, images, pair.homography, settings, (INLIER_THRESHOLD_PX, SEEDS))
     row: Row = {
         "kind": pair.kind,
-        **accuracy,
-        "all matches": without_ratio["matches"],
-        **{("accuracy", px): without_ratio["precision", px] for px in MATCH_THRESHOLDS_PX},
+        **match_accuracy(*points, *keypoints, pair.homography, sizes),
         "corner errors": run.cached("corner_errors", depends, corner_errors)["errors"].tolist(),
     }
     # SIFT repeats some positions with other orientations. For repeatability a position counts once.
@@ -162,10 +149,7 @@ def _at_budget(
 
     depends = (feature.detection, (pair.first, pair.second), pair.homography, budget, RADII_PX)
     rows = run.cached("repeatability_mutual_nn", depends, make)["rows"].tolist()
-    row: Row = {
-        ("keypoints", budget): min(len(first), len(second)),
-        ("coverage", budget): coverage(first.xy, sizes[0]),
-    }
+    row: Row = {("keypoints", budget): min(len(first), len(second))}
     for radius, values in zip(RADII_PX, rows, strict=True):
         for name, value in zip(("repeated", "chance", "localization"), values, strict=True):
             row[name, budget, radius] = value
@@ -211,8 +195,6 @@ def standard_tables(
     tables += [
         ("matching", f"Matches, {what}", MATCHING_COLUMNS, MATCHING_NOTE),
         ("homography", f"Homographies, {what}", _homography_columns(), HOMOGRAPHY_NOTE),
-        ("accuracy", f"Mean matching accuracy, {what}", ACCURACY_COLUMNS, ACCURACY_NOTE),
-        ("coverage", f"Coverage, {what}", COVERAGE_COLUMNS, COVERAGE_NOTE),
     ]
     return [
         tabulate(f"{key}_{name}", title, features, rows, {**PAIRS, **columns}, note)
@@ -288,13 +270,6 @@ MATCHING_COLUMNS: Columns = {
     },
 }
 
-ACCURACY_COLUMNS: Columns = {
-    "matches": average(",.0f", "all matches"),
-    **{f"{px} px": average(".3f", ("accuracy", px)) for px in MATCH_THRESHOLDS_PX},
-}
-
-COVERAGE_COLUMNS: Columns = {budget_name(b): average(".3f", ("coverage", b)) for b in BUDGETS}
-
 REPEATABILITY_NOTE = (
     "The columns are numbers of best keypoints per image (budgets). Repeatability: number of pairs "
     "of keypoints that are mutual nearest neighbours and at most the radius apart, divided by the "
@@ -318,15 +293,4 @@ HOMOGRAPHY_NOTE = (
     "second image; it is infinite for pairs without an estimate. Accuracy: fraction of the pairs "
     "with an error up to a threshold; AUC: area under the curve of this fraction, as in SuperGlue. "
     f"Values are means over {SEEDS} seeds of MAGSAC; ± is the standard deviation over the seeds."
-)
-
-ACCURACY_NOTE = (
-    "Fraction of the matches with an error up to each number of pixels, mean over the pairs. All "
-    f"methods match the best {MATCHING_BUDGET:,} keypoints by mutual nearest neighbours without a "
-    "ratio test."
-)
-
-COVERAGE_NOTE = (
-    "The first image is divided into cells of 32x32 px. Coverage: fraction of the cells that "
-    "contain a keypoint, for each number of best keypoints; mean over the pairs."
 )

@@ -73,7 +73,7 @@ def draw_crop(rng: np.random.Generator, reading: Reading) -> Crops | None:
     view = View(to_photograph, side_px=CROP_PX).render(reading.luma) / WHITE
     places = xy[rows] + rng.uniform(-JITTER_PX, JITTER_PX, (CROP_POINTS, 2))
     sizes = reading.sizes[rows] / scale * np.exp(rng.normal(0, SIZE_ERRORS[0], CROP_POINTS))
-    survival = reading.scores[:, 1].argsort(kind="stable").argsort()[rows] / len(reading.xy)
+    survival = reading.scores.argsort(kind="stable").argsort()[rows] / len(reading.xy)
     places, sizes = places.astype(np.float32), sizes.astype(np.float32)
     clean = happens(rng, CLEAN_SHARE)
     image = (view * WHITE).clip(0, WHITE).astype(np.uint8) if clean else photograph_view(rng, view)

@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, relu
+from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from deepdetect._shared.errors import MissingWeightsError, WeightsError
 from deepdetect.features.learned import LENGTH
@@ -59,13 +60,13 @@ after a convolution in a sequence `layer` is its batch normalisation."""
 
 
 class Residual(nn.Module):
-    """Two convolutions whose result is added to the input, or to a linear map of it."""
+    """Two convolutions whose result is added to a linear map of the input."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
         self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
-        self.skip = nn.Identity() if inputs == outputs else nn.Conv2d(inputs, outputs, 1)
+        self.skip = nn.Conv2d(inputs, outputs, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         return relu(self.second(relu(self.first(x))) + self.skip(x))
@@ -178,8 +179,7 @@ def _folded(stored: dict[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
     sequence, _, place = name.rpartition(".")
     if not place.isdigit():
         return weight, stored[f"{name}.bias"]
-    names = "weight", "bias", "running_mean", "running_var"
     norm = f"{sequence}.{int(place) + 1}"
-    gain, shift, mean, variance = (stored[f"{norm}.{each}"] for each in names)
-    gain = gain * (variance + VARIANCE).rsqrt()
-    return weight * gain[:, None, None, None], shift - mean * gain
+    statistics = stored[f"{norm}.running_mean"], stored[f"{norm}.running_var"]
+    scale = stored[f"{norm}.weight"], stored[f"{norm}.bias"]
+    return fuse_conv_bn_weights(weight, None, *statistics, VARIANCE, *scale)

@@ -70,7 +70,10 @@ def stack(pairs: Sequence[Pair]) -> Pair:
 
 
 class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
-    """The pairs that each step is the first to use, determined by the seed and their numbers."""
+    """Each step, with the pairs that it is the first to use (or None) and their numbers.
+
+    The seed and its number determine a pair.
+    """
 
     def __init__(self, files: Sequence[Path], options: DescriptorTrainingOptions) -> None:
         self.files, self.options = files, options
@@ -163,14 +166,15 @@ class DescriptorTrainer(Trainer):
         """Return the factor of the learning rate of a parameter."""
         return 1.0
 
-    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of (step, numbers, pairs) for steps `first` to `last` - 1.
+    def dataset(self) -> Dataset[Any]:
+        """Return a dataset of batches, indexed by the items of `pairs_to_draw`."""
+        return PairDataset(self.files, self.options)
 
-        `pairs` holds the pairs that no earlier step has used, or None; `numbers` identifies them.
-        """
-        to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
+    def loader(self, first: int = 0) -> DataLoader[Any]:
+        """Return a loader of the batches from step `first` on."""
+        to_draw = pairs_to_draw(self.options, first, self.steps)
         return DataLoader(
-            PairDataset(self.files, self.options),
+            self.dataset(),
             batch_size=None,
             sampler=list(to_draw),
             num_workers=self.num_workers,

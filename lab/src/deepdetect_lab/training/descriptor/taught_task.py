@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from ..recipe import DescriptorTrainingOptions, DeviceOptions
 from ..teachers.readings import Whitening, reading_file
@@ -17,7 +16,7 @@ from ..trainer import seeded
 from .crops import Crops, draw_crops
 from .edge import BACKBONE, EdgeNetwork
 from .losses import KINDS
-from .task import DescriptorTrainer, PairDataset, pairs_to_draw
+from .task import DescriptorTrainer, PairDataset
 from .teaching import PAIR_WEIGHT, crop_losses, measure_teaching
 from .views import Pair
 
@@ -101,16 +100,9 @@ class TaughtTrainer(DescriptorTrainer):
     def rate_factor(self, name: str) -> float:
         return BACKBONE_RATE if name.startswith(BACKBONE) else 1.0
 
-    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader like that of a `DescriptorTrainer`, with the crops of each step."""
-        to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
-        return DataLoader(
-            TaughtDataset(self.files, self.options, self.readings),
-            batch_size=None,
-            sampler=list(to_draw),
-            num_workers=self.num_workers,
-            generator=torch.Generator(),
-        )
+    def dataset(self) -> Dataset[Any]:
+        """Return a dataset like that of a `DescriptorTrainer`, with the crops of each step."""
+        return TaughtDataset(self.files, self.options, self.readings)
 
     def loss(self, batch: tuple[tuple[int, list[int], Pair | None], Crops]) -> Tensor:  # type: ignore[override]
         """Return the sum of the losses of a step's pairs and crops."""

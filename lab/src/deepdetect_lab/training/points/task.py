@@ -136,9 +136,9 @@ class RankerTrainer(Trainer):
         self.origin = digests(images, validation)
         self.notes = {"images": str(len(self.files))}
 
-    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return a loader of the batches, lists of pairs, for steps `first` to `last` - 1."""
-        steps, pairs = range(first, self.steps if last is None else last), range(self.options.pairs)
+    def loader(self, first: int = 0) -> DataLoader[Any]:
+        """Return a loader of the batches, lists of pairs, from step `first` on."""
+        steps, pairs = range(first, self.steps), range(self.options.pairs)
         return DataLoader(
             PairDataset(self.files, self.options),
             batch_sampler=[[(step, number) for number in pairs] for step in steps],

@@ -20,7 +20,7 @@ from deepdetect.detector.points.detection import SIZE_PER_SIGMA, least_distances
 from deepdetect.features.selection import suppress_neighbors
 from deepdetect.io.image import load_image, luma
 
-from .aliked import SCORE_WINDOW, load_aliked
+from .aliked import load_aliked
 
 POINTS, STRONG_SHARE, STRONG_DENSITY = 1280, 0.5, 2048 / (640 * 480)
 """A reading has at most 1,280 points, because each takes 400 bytes. Half of them are drawn from the
@@ -38,17 +38,14 @@ class Reading(NamedTuple):
         luma: the photograph, (H, W) uint8.
         xy: positions (N, 2) float32, in pixels.
         sizes: diameters (N,) float32, in pixels.
-        places: (N,) int64 ranks of the points in the ranker's order of all points, from 0.
         codes: (N, 192) float16 descriptors: 64 numbers of EdgePoint2 and 128 of ALIKED, each part a
             unit vector.
-        scores: (N, 2) float16 scores of EdgePoint2 (logits) and ALIKED (in [0, 1]), the highest
-            within 2 px.
+        scores: (N,) float16 scores of ALIKED in [0, 1], the highest within 2 px.
     """
 
     luma: np.ndarray
     xy: np.ndarray
     sizes: np.ndarray
-    places: np.ndarray
     codes: np.ndarray
     scores: np.ndarray
 
@@ -107,23 +104,19 @@ class Teachers:
     """EdgePoint2-E64 and ALIKED-n16rot.
 
     `edgepoint` is an ONNX file that maps `image` (1, 1, H, W), the mean of RGB in [0, 1], to
-    `scores` (1, 1, H, W) and `descriptors` (1, 64, H/4, W/4). `aliked` is the authors' file of
-    weights.
+    `descriptors` (1, 64, H/4, W/4). `aliked` is the authors' file of weights.
     """
 
-    def __init__(self, edgepoint: Path, aliked: Path, threads: int = 1) -> None:
-        self.edgepoint, self.aliked = start_session(str(edgepoint), threads), load_aliked(aliked)
+    def __init__(self, edgepoint: Path, aliked: Path) -> None:
+        self.edgepoint, self.aliked = start_session(str(edgepoint), 1), load_aliked(aliked)
 
     def read(self, rgb: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return codes (N, 192) and scores (N, 2), float32, at points of (H, W, 3) uint8 RGB."""
+        """Return codes (N, 192) and scores (N,), float32, at points of (H, W, 3) uint8 RGB."""
         image = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)[None])).float() / 255
         codes, scores = self.aliked(image, torch.from_numpy(xy).float())
-        first = self._read_edgepoint(rgb, xy)
-        both = zip(first, (codes.numpy(), scores.numpy()[:, None]), strict=True)
-        codes_of_both, scores_of_both = map(np.hstack, both)
-        return codes_of_both, scores_of_both
+        return np.hstack([self._read_edgepoint(rgb, xy), codes.numpy()]), scores.numpy()
 
-    def _read_edgepoint(self, rgb: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _read_edgepoint(self, rgb: np.ndarray, xy: np.ndarray) -> np.ndarray:
         sides = np.array([rgb.shape[1], rgb.shape[0]])
         unit = EDGEPOINT_MULTIPLE
         width, height = (max(unit, round(side / unit) * unit) for side in sides.tolist())
@@ -131,40 +124,32 @@ class Teachers:
         if (width, height) != tuple(sides):
             how = cv2.INTER_AREA if width < sides[0] else cv2.INTER_LINEAR
             gray = cv2.resize(gray, (width, height), interpolation=how)
-        names = ["scores", "descriptors"]
-        scores, maps = self.edgepoint.run(names, {"image": gray[None, None]})
+        (maps,) = self.edgepoint.run(["descriptors"], {"image": gray[None, None]})
         places = torch.from_numpy(((xy + 0.5) / sides * 2 - 1).astype(np.float32))[None, None]
         how = {"align_corners": False, "padding_mode": "border"}
         codes: Tensor = grid_sample(torch.from_numpy(maps), places, **how)[0, :, 0].T
-        highest = cv2.dilate(scores[0, 0], np.ones((SCORE_WINDOW,) * 2, np.uint8))
-        pixels = (xy + 0.5) * (width, height) / sides - 0.5
-        column, row = np.rint(pixels).astype(int).clip(0, (width - 1, height - 1)).T
-        return normalize(codes, dim=1).numpy(), highest[row, column][:, None]
+        return normalize(codes, dim=1).numpy()
 
 
-def choose_points(
-    gray: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose strong and weak keypoints at random; return their positions, sizes and ranks."""
+def choose_points(gray: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Choose strong and weak keypoints at random, best first; return their positions and sizes."""
     candidates, logits = rank_candidates(gray)
     kept = suppress_neighbors(candidates.xy, logits, least_distances(candidates.sigma_px))
     best = min(len(kept), round(STRONG_DENSITY * gray.size))
     strong = rng.permutation(best)[: round(POINTS * STRONG_SHARE)]
     weak = best + rng.permutation(len(kept) - best)[: POINTS - len(strong)]
-    places = np.sort(np.concatenate([strong, weak]))
-    rows = kept[places]
-    sizes = SIZE_PER_SIGMA * candidates.sigma_px[rows]
-    return candidates.xy[rows], sizes, places
+    rows = kept[np.sort(np.concatenate([strong, weak]))]
+    return candidates.xy[rows], SIZE_PER_SIGMA * candidates.sigma_px[rows]
 
 
-def read_photograph(teachers: Teachers, image: object, seed: int = 0) -> Reading:
+def read_photograph(teachers: Teachers, image: object) -> Reading:
     """Run the teachers at keypoints of a photograph in any form that `load_image` accepts."""
     rgb = load_image(image)
     gray = luma(rgb)
-    xy, sizes, places = choose_points(gray, np.random.default_rng(seed))
+    xy, sizes = choose_points(gray, np.random.default_rng(0))
     codes, scores = teachers.read(rgb, xy)
     xy, sizes = xy.astype(np.float32), sizes.astype(np.float32)
-    return Reading(gray, xy, sizes, places, codes.astype(np.float16), scores.astype(np.float16))
+    return Reading(gray, xy, sizes, codes.astype(np.float16), scores.astype(np.float16))
 
 
 def reading_file(image: Path, folder: Path) -> Path:

@@ -10,7 +10,7 @@ import pytest
 from deepdetect import DeepDetect, ImageError
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.io.image import luma
-from deepdetect_lab.evaluation.protocols.masks import (
+from deepdetect_lab.evaluation.masks import (
     NUM_BINS,
     LabelDetector,
     MaskScore,
@@ -170,7 +170,7 @@ def bundled_scores(shared: Path, backend: str) -> dict[str, MaskScore]:
 )
 def test_bundled_weights_score_as_the_results_say(shared: Path, backend: str) -> None:
     """What the model card and README quote, so that these cannot fall behind the weights."""
-    results = Path(__file__).parents[4] / "docs" / "results" / "label-prediction.csv"
+    results = Path(__file__).parents[3] / "docs" / "results" / "label-prediction.csv"
     row = next(csv.DictReader(results.read_text("utf-8").splitlines()))
     for light, score in bundled_scores(shared, backend).items():
         assert score.loss == pytest.approx(float(row[f"{light}, loss"]), abs=0.0005)
