@@ -1,13 +1,13 @@
 """Refine the homography of a plane by tracks, find parallax off the plane, and match along it.
 
 The second image is warped by the homography of a plane. Corners and tentative matches are tracked
-the warped image. A homography is fitted to the largest set of tracks on one plane. To validate it,
-the image is divided like a chessboard: a fit to the black squares and a fit to the white ones must
-agree with no fewer tracks in the squares of the other colour than the initial homography does.
+from the first image to the warped one. A homography is fitted to the largest set of tracks on one
+plane. It is kept if homographies fitted to the black and to the white squares of a chessboard fit,
+each in the squares of the other colour, together no fewer tracks than the initial homography.
 
-If the homography does not explain a place of a static scene, the place is displaced along a line
-through the epipole (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant
-plane", 2005). Lens distortion, wind and wrong tracks displace places in any direction.
+In a static scene, parallax displaces points off the plane along lines through the epipole (Chum,
+Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane", 2005). Lens
+distortion, wind and wrong tracks displace points in any direction.
 """
 
 from __future__ import annotations
@@ -24,42 +24,42 @@ from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
 
 SIDE_PX, MAX_SCALE_RATIO, MIN_SCALE = 1024, 1.5, 1 / 16
-"""Images are reduced to a longer side of SIDE_PX. If their scales differ by more than
-MAX_SCALE_RATIO, the finer image is reduced further, at most to MIN_SCALE of its size, because
-corners of different scales lie at different places. Lengths below are in reduced pixels."""
+"""Images are reduced to a longer side of SIDE_PX. An image that shows the plane MAX_SCALE_RATIO
+times larger is reduced to the other's scale (at most to MIN_SCALE of its size), because corners
+of different scales lie at different places. Lengths of tracks are in reduced pixels."""
 
 CORNERS, WINDOW_PX, CELL_PX = 1500, 21, 16
-"""Maximum number of tracked corners, side of the windows around them, and side of the squares in
-each of which one track is used to measure parallax."""
+"""Maximum number of tracked corners, side of the windows that are tracked around them, and side of
+the squares that each give one track to measure parallax. Chosen by hand."""
 
 MIN_TRACKS, SQUARES = 15, 8
-"""A geometry is fitted to at least this number of tracks. The chessboard has this many squares
-along the longer side."""
+"""A geometry is fitted to at least MIN_TRACKS tracks. The chessboard by which a homography is
+validated has SQUARES squares along the longer side of the image. Chosen by hand."""
 
 MAX_PARALLAX = 0.1
-"""Tentative matches farther from the plane than this fraction of the longer side are not tracked,
-because the views differ too much there."""
+"""A tentative match is not tracked if it ends farther than this fraction of the longer side from
+where the homography maps it: the views differ too much there. Chosen by hand."""
 
 NOISE_PX = 1.0
-"""Tracks nearer than this to the plane count as on it. The error of tracks is a third of this."""
+"""A track is on the plane if it ends nearer than this, three track errors, to its prediction."""
 
 MAX_DISTANCE_PX = 1.0
-"""A keypoint of the second image may be a partner if it is nearer than this to the place where the
-homography maps the keypoint of the first image: positions are whole pixels."""
+"""A homography matches two keypoints if it maps the first to within this many full-size pixels of
+the second. Both lie on whole pixels, and rounding alone displaces each by up to 0.7 px."""
 
 SAMPLES, MAX_ANGLE = 1000, 0.25
-"""SAMPLES epipoles are tried. A displacement agrees with an epipole if it is within MAX_ANGLE
-radians of the line to it: the error of a track turns a displacement of 1 px by a similar angle."""
+"""SAMPLES epipoles are tried. A displacement agrees with one if its direction is within MAX_ANGLE
+radians of the line to it: the error of a track turns a displacement of 1 px by about as much."""
 
 MIN_ALIGNED, MIN_SHARE, MIN_FAR_SHARE = 0.8, 0.08, 0.02
 """A scene has depth if at least MIN_ALIGNED of the tracks off the plane agree with one epipole, and
-these are MIN_SHARE of all tracks. Something stands before the plane if the same holds, with
-MIN_FAR_SHARE, of the tracks that are off it by more than FAR times the noise. By chance, 0.16 of
-the tracks agree with the best epipole."""
+these are MIN_SHARE or more of all tracks. An object stands before the plane if MIN_ALIGNED of the
+tracks off it by FAR * NOISE_PX or more agree, and these are MIN_FAR_SHARE of all tracks. A random
+direction agrees with a given epipole with a probability of 0.16. Limits are chosen by hand."""
 
 SURE_SHARE = 0.28
-"""A scene also has depth if this fraction of all tracks are off the plane and agree with one
-epipole: up to 0.23 on planes of Oxford, 0.32 on a facade (entry 1-3), 0.42 on cloth at 480 px."""
+"""A scene also has depth if this share of all tracks is off the plane and agrees with one epipole.
+The share is at most 0.23 on planes of Oxford, 0.32 on entry 1-3 and 0.42 on Middlebury's cloth."""
 
 FAR = 3.0
 
@@ -70,10 +70,10 @@ NOTHING: Pair = np.empty((0, 2)), np.empty((0, 2))
 class PlaneTracks:
     """Corners and matches, (M, 2) in both images, tracked relative to the plane of a homography.
 
-    If `free`, (rows, columns) bool, is given, corners start only in the cells where it is true.
+    Corners start only where `free`, (rows, columns) bool for the cells of the image, is true.
 
     Attributes:
-        homography: (3, 3), fitted to the tracks if that makes it more exact.
+        homography: (3, 3), fitted to the tracks if the fit is validated, otherwise as given.
         points: (N, 2) in each image, where the tracks start and end.
     """
 
@@ -100,13 +100,13 @@ class PlaneTracks:
         if correction is not None and self._validated():
             refined = scaled_homography(matrix @ correction, 1 / scale0, 1 / scale1)
             self.homography = refined / refined[2, 2]
-        # Parallax is seen best from the plane that fits most sharply.
+        # Parallax is measured from the plane on which most tracks lie within NOISE_PX / 2.
         sharp = _fitted(self._starts, self._ends, NOISE_PX / 2)
         if sharp is not None:
             self._ends = transform_points(self._ends, np.linalg.inv(sharp))
 
     def _validated(self) -> bool:
-        """Return whether fits to squares of one colour suit no fewer tracks of the other colour."""
+        """Return whether fits to squares of either colour hold in those of the other colour."""
         starts, ends = self._starts, self._ends
         black = (starts // (self._side / SQUARES)).sum(axis=1) % 2 == 1
         gain = -np.count_nonzero(_on_plane(starts, ends))
@@ -142,7 +142,7 @@ class PlaneTracks:
 def match_along_plane(
     pair: ImagePair, pixels: Pair, homography: np.ndarray, judge: Judge, evidence: Evidence
 ) -> GuidedMatches:
-    """Match keypoints on integer pixels, (N, 2) and (M, 2), in the cells of `evidence.believed`."""
+    """Match keypoints on whole pixels, (N, 2) and (M, 2), in the cells of `evidence.believed`."""
     predicted = transform_points(pixels[0], homography)
     indices1, distances = nearest_keypoints(predicted, pixels[1], pair.sizes[1])
     indices0 = np.flatnonzero(distances < MAX_DISTANCE_PX)
@@ -160,7 +160,7 @@ def _on_plane(expected: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 def _fitted(starts: np.ndarray, ends: np.ndarray, threshold_px: float) -> np.ndarray | None:
-    """Return the homography of the plane with most tracks; None if there are too few."""
+    """Return the homography of the plane with most tracks; None below `MIN_TRACKS` tracks."""
     if len(starts) < MIN_TRACKS:
         return None
     options = GeometryOptions(inlier_threshold=threshold_px)

@@ -1,11 +1,10 @@
 """Dense matches of a scene with depth, by rectification: epipolar lines become rows.
 
-Corresponding rows are matched (`matching.stereo`) over a range of disparities that sparse matches
-give. Each match ends at a sub-pixel position, not at a keypoint.
+Corresponding rows are matched (`matching.stereo`) over the range of disparities of sparse matches.
+Each match ends at a sub-pixel position, not at a keypoint.
 
-A fundamental matrix from few matches may be wrong by some pixels far from these matches. So corners
-are tracked from one view to the other, starting from the matches of the rows, and the matrix is
-fitted to the tracks.
+A fundamental matrix from few matches may be wrong by some pixels far from these matches. So it is
+fitted also to corners, which are tracked from where the disparities predict them.
 
 The constants were chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip, unless noted.
 """
@@ -45,31 +44,32 @@ from .along_plane import CORNERS, MAX_PARALLAX, MIN_TRACKS, WINDOW_PX
 from .image_pair import Pair
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
-"""Options for matching rows. The range of disparities is set for each pair."""
+"""Options for matching rectified rows. Sparse matches set the range of disparities of a pair."""
 
 MAX_PIXELS, MAX_VOLUME = 1e6, 1.2e7
-"""Frames have at most MAX_PIXELS pixels. Their disparities are searched in copies that are scaled
-down if pixels times disparities exceed MAX_VOLUME, to bound time and memory; then they are refined
-in the frames themselves."""
+"""Rectified images have at most MAX_PIXELS pixels. If pixels times disparities exceed MAX_VOLUME,
+disparities are searched in reduced copies, to bound time and memory. They are then refined in the
+rectified images themselves."""
 
 MAX_STEP_PX = 4.0
-"""If the step with which all disparities are searched exceeds this, those near the plane are also
-searched alone, in finer steps; the result with more matches is kept."""
+"""If disparities are searched in coarser steps than this, those near a known plane are also
+searched alone, in finer steps. The result with more matches is kept."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
-"""The range of disparities is extended at both ends by this many pixels plus this fraction of its
-length. Chosen on Oxford and others."""
+"""The range of disparities is extended at both ends by MARGIN_PX plus MARGIN_FRACTION of its
+length. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
-"""Side of the windows in which rectified views are correlated, and sigma of the preceding blur."""
+"""Side of the windows in which rectified views are correlated, and sigma of their blur before."""
 
 MAX_DISAGREEMENT_PX = 3.0
-"""A sparse match agrees with the disparity map if their disparities differ by less than this. The
-limit is loose, because sparse matches come from another scale. Chosen on Oxford and others."""
+"""A sparse match agrees with the disparity map if their disparities differ by less than this number
+of search steps (pixels). The limit is loose, because sparse matches come from another scale.
+Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_AGREEMENT = 0.6
-"""This fraction or more of the sparse matches must agree with the disparities. On facades, a
-quarter of the sparse matches end at the next window on the epipolar line."""
+"""This fraction of the sparse matches, or more, must agree with the disparity map. The limit is not
+higher, since on facades a quarter of them end one window farther along the epipolar line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,15 +89,15 @@ class RectifiedView:
     correlation: np.ndarray
 
     def to_frame(self, points: np.ndarray, side: int) -> np.ndarray:
-        """Map points from an image of full size to the frame."""
+        """Map (N, 2) points of full-size image number `side` (0, 1) to its rectified view."""
         return self.frame.to_frame(scaled_points(points, self.scale), side)
 
     def from_frame(self, points: np.ndarray, side: int) -> np.ndarray:
-        """Map points from the frame to an image of full size."""
+        """Map (N, 2) points of rectified view number `side` (0, 1) to its full-size image."""
         return scaled_points(self.frame.from_frame(points, side), 1 / self.scale)
 
     def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the indices of the points inside the frame, and their pixels' columns and rows."""
+        """Return the indices of points inside the view, and their pixels' columns and rows."""
         height, width = self.disparity.shape
         nearest = np.rint(np.where(np.isfinite(points), points, -1)).astype(np.int64)
         inside = np.flatnonzero(((nearest >= 0) & (nearest < (width, height))).all(axis=1))
@@ -135,7 +135,7 @@ def match_by_rectification(
 def _best_view(
     grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None
 ) -> tuple[RectifiedView, Pair] | None:
-    """Return the view with most matches, for all disparities or near a plane, and its tracks."""
+    """Match rows, over all disparities or near a plane; return the denser view, and its tracks."""
     ways, best, most = [sparse], None, 0.0
     if plane is not None:
         reach_px = MAX_PARALLAX * max(grays[0].shape)
@@ -194,7 +194,7 @@ def _volume(frame: RectifiedFrame, sparse: Pair) -> float:
 def _frame(
     grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None, scale: float
 ) -> RectifiedFrame | None:
-    """Return the frame of images that are scaled down, from geometry at their full size."""
+    """Return the rectification of reduced images, `grays`, from geometry at full size."""
     points0, points1 = (scaled_points(points, scale) for points in sparse)
     fundamental = scaled_fundamental(fundamental, scale, scale)
     plane = None if plane is None else scaled_homography(plane, scale, scale)
@@ -261,7 +261,7 @@ def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
 
 
 def _track(view: RectifiedView) -> Pair | None:
-    """Track corners to the second view, starting from the matches of the rows.
+    """Track corners of the first view, from where disparities predict them in the second.
 
     Returns the corners in both images at full size; None with fewer than `MIN_TRACKS` tracks.
     """

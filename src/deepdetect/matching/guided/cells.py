@@ -10,19 +10,19 @@ from ...geometry.transforms import scaling_matrix
 
 SIDE_PX = 480
 """Images are scaled to this longer side before they are compared, so that cells have one size
-relative to the image. A homography that is off by 3 pixels at 640 still aligns them."""
+relative to the image. A homography that is off by 3 of 640 pixels still aligns the cells."""
 
 CELL_PX, SIZES_PX = 4, (2.5, 4.5)
 """Cells are CELL_PX pixels apart, and described by RootSIFT at two keypoint diameters, SIZES_PX. A
-descriptor covers six diameters. With 3 and 6, edges of small planes are less sharp; with smaller
-diameters, fewer cells remain in darkness and fog."""
+descriptor covers six diameters. Diameters of 3 and 6 px blur the outlines of small planes. With
+diameters below SIZES_PX, fewer cells match in darkness and fog."""
 
 WINDOW_CELLS = 16
 """Number of cells in a window of 16 x 16 pixels. Explained parts of images are counted in windows,
 because adjacent cells share most of their pixels."""
 
 MIN_WINDOWS_AROUND = 5
-"""The place of a window is predicted if most of the eight windows around it hold matches."""
+"""The place of a window is predicted if this many of its eight neighbours hold matches."""
 
 MARGIN_PX = 9
 """Cells closer than this to the border of an image or of an ignored area are not compared: their
@@ -55,7 +55,7 @@ def at_cells(mask: np.ndarray) -> np.ndarray:
 
 
 def describe(gray: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return unit descriptors of all cells, (N, D) float32, 0 in flat cells, and their shape."""
+    """Return (N, D) float32 unit descriptors of cells, 0 in flat ones, and (rows, columns)."""
     height, width = gray.shape
     x, y = (np.arange(CELL_PX // 2, side, CELL_PX) for side in (width, height))
     pixels = np.dstack(np.meshgrid(x, y)).reshape(-1, 2)
@@ -78,7 +78,7 @@ def gathered(
     field: np.ndarray,
     here: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Correlate the cells of the first image with displaced ones, averaged over neighbours.
+    """Correlate cells of the first image with displaced ones of the second, averaged over 3 x 3.
 
     `field` holds the displacement (x, y) in cells of each cell of `first`, whose positions are
     `here`. Returns float32, NaN where the displaced cell is not `valid`.

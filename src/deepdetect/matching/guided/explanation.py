@@ -26,7 +26,7 @@ from .judge import Evidence, Judge, contradicts
 from .proposals import MIN_MATCHES, Hypothesis, Sources, Tentative, planes, propose
 
 MIN_MATCHED_FRACTION = 0.02
-"""Dense matching fails if it matches less than this fraction of the smaller set of keypoints."""
+"""Dense matching fails below this fraction of the smaller set of keypoints. Chosen by hand."""
 
 MOST = 2 / 3
 """A scene has depth if a homography explains less than this fraction of the matches that agree with
@@ -34,21 +34,21 @@ a fundamental matrix. The confidence is "high" only if at least this fraction of
 the first geometry, because the other matches lie on objects that move differently."""
 
 NEARLY_ALL = 0.9
-"""If a plane explains this fraction of the compared cells, only half of the fundamental matrix's
-inliers, not `MOST`, must fit the plane: matches to a wrong period of a pattern also lie on epipolar
-lines. If the plane explains less, an object in front of it is also looked for."""
+"""A plane may be the whole scene if it fits MOST of the inliers of a fundamental matrix, or half of
+them if it explains NEARLY_ALL of the compared cells: matches to a wrong period of a pattern also
+lie on epipolar lines. Below NEARLY_ALL, objects before the plane are looked for."""
 
 MAX_NEARBY_LOG10_NFA = -3.0
-"""Without dense matches, sparse matches suffice if the log10 NFA of their geometry is below
-HIGH_LOG10_NFA, and its log10 NFA among nearby matches (`log10_nfa_nearby`) is below this. Matches
-that stand still are not counted, because they may come from a frame or from the image borders,
-which descriptors see. The wrong ones of 40 sparse answers reach -2.3 among nearby matches."""
+"""Sparse matches without dense ones suffice if the log10 NFA of their geometry is below
+HIGH_LOG10_NFA, and that among nearby matches (`log10_nfa_nearby`) below this. Still matches do not
+count: descriptors see frames and image borders. In 40 sparse answers of all test sets, wrong ones
+have -2.3 or more among nearby matches; right ones of ten wide baselines have -4.3 or less."""
 
 MIN_KEPT = 0.8
-"""Depth also wins over a plane if it explains this fraction of the plane's cells it can compare."""
+"""Depth also wins over a plane if it explains this fraction of the plane's cells both compare."""
 
 OFF_RATIO = 4.0
-"""Further layers come from matches with errors above this multiple of the inlier threshold."""
+"""Further geometries use matches that miss all earlier ones by this many inlier thresholds."""
 
 MIN_CHOSEN = 0.75
 """If this fraction of the tentative matches agrees with a plane, the plane is accepted although a
@@ -56,27 +56,27 @@ displaced copy fits as well, because descriptors tell the periods of the pattern
 is 0.45 to 0.9 on circuit boards, and up to 0.68 on 30 synthetic facades with identical windows."""
 
 MIN_GAIN = 1.05
-"""A plane moves on its own if it and a fundamental matrix F of other matches fit this many times
-as many matches as one matrix for all, and F fits less than a third of the plane's matches."""
+"""A plane moves on its own if it and a fundamental matrix F of the other matches fit MIN_GAIN times
+as many matches as one matrix for all, and F fits under a third of the plane's. Chosen by hand."""
 
 MAX_STILL = 0.005
-"""A homography is still if it moves all corners by less than this fraction of the longer side. At
-640 pixels, this is about the inlier threshold of a homography, 3 pixels."""
+"""An image stands still if its homography moves all image corners by less than this fraction of
+the longer side. At 640 pixels, this is about the inlier threshold of a homography, 3 pixels."""
 
 MIN_MOVING = 0.5
-"""Still layers (a caption, a part of the vehicle) are left out if a moving layer explains at least
-this many times as many windows. Otherwise, an object moves in front of a still camera."""
+"""Geometries that stand still (a caption, a part of the vehicle) are left out if a moving one
+explains this fraction of the windows of the largest one. Otherwise, the camera stands still."""
 
 MAX_LAYERS = 4
-"""Maximum number of geometries of one pair: one of the scene, the others of moving objects."""
+"""Maximum number of geometries per pair: the scene and moving objects. Chosen by hand."""
 
 HIGH_SHARE, HIGH_LOG10_NFA = 0.2, -12.0
-"""The confidence is "high" only if the images confirm at least HIGH_SHARE of the compared cells and
-the log10 number of false alarms of the sparse matches is below HIGH_LOG10_NFA."""
+"""Confidence is "high" only if HIGH_SHARE of the compared cells are explained and the log10 NFA is
+below HIGH_LOG10_NFA. With no such limit, sparse matches answered one of 165 unrelated pairs."""
 
 SCENE_MATCHES, DOMINANT_FRACTION = 1000, 0.5
-"""A plane is dominant if at least DOMINANT_FRACTION of the dense matches, of which SCENE_MATCHES
-are drawn at random, lie on it: it is then the largest part of the scene."""
+"""A plane is dominant if at least DOMINANT_FRACTION of SCENE_MATCHES dense matches, which are drawn
+at random, lie on it. It is then the largest part of the scene."""
 
 
 NO_MATCHES = GuidedMatches(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.float32))
@@ -84,7 +84,7 @@ NO_MATCHES = GuidedMatches(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A geometry, its matches and evidence. If `repeated`, a displaced copy explains as much."""
+    """A geometry, its matches and evidence; `repeated` if a displaced copy of it fits as well."""
 
     hypothesis: Hypothesis
     matches: GuidedMatches
@@ -94,7 +94,7 @@ class Layer:
 
 
 class Explanation:
-    """The layers of a pair, the one that explains most first."""
+    """The geometries (layers) of a pair of images, the one that explains most first."""
 
     def __init__(
         self,
@@ -170,7 +170,7 @@ class Explanation:
         return self._judges[cross_modal]
 
     def _confirmed(self, tentative: Tentative, free: np.ndarray | None = None) -> Iterator[Layer]:
-        """Yield layers that the images confirm, the best first, then sparse ones."""
+        """Yield layers that the images confirm, best first, then one of sparse matches alone."""
         epipolar, (refuted, chance) = None, np.zeros((2, len(tentative.points0)), bool)
         surely, limit = False, np.inf if free is None else HIGH_LOG10_NFA
         if self._asked != "homography":
@@ -302,7 +302,7 @@ class Explanation:
         return Layer(hypothesis, matches, nothing)
 
     def _suffices(self, layer: Layer) -> bool:
-        """Return whether the sparse matches of a layer are enough evidence without the images."""
+        """Return whether the sparse matches of a layer suffice (see `MAX_NEARBY_LOG10_NFA`)."""
         hypothesis = layer.hypothesis
         sizes, tentative = self._pair.sizes, hypothesis.tentative
         motion = np.linalg.norm(tentative.points1 - tentative.points0, axis=1)
@@ -332,7 +332,7 @@ class Explanation:
             return TwoViewGeometry("none", evidence=evidence), None
         first = self.layers[0]
         own = first.hypothesis
-        planes_move = own.model == "homography" and len(self.layers) > 1  # this can mimic a lens
+        planes_move = own.model == "homography" and len(self.layers) > 1  # planes can mimic a lens
         if self._asked != "homography" and not planes_move:
             straight_lines(self._pair, own)
         matches = first.matches
@@ -436,7 +436,7 @@ def _copies(plane: Layer, other: Layer) -> bool:
 
 
 def _wins(deep: Layer, plane: Layer) -> bool:
-    """Return whether depth explains half as many windows as a plane, or `MIN_KEPT` of its cells."""
+    """Return whether `deep` has half of `plane`'s windows, or explains `MIN_KEPT` of its cells."""
     compared = plane.evidence.explained & np.isfinite(deep.evidence.similarity)
     kept = compared.any() and _mostly(compared & deep.evidence.explained, compared, MIN_KEPT)
     return bool(kept) or deep.evidence.windows >= plane.evidence.windows / 2

@@ -8,8 +8,8 @@ copies that are displaced by a quarter of the image or more.
 On repeated patterns (windows, tiles, fences), a copy that is displaced by a period aligns cells as
 well as the correct geometry does. So the copies that correlate best as a whole are compared with
 the geometry, cell by cell. The geometry must explain clearly more cells than each of them. Content
-that recurs one period away in the first image is no evidence for it: where the pattern ends, its
-next period may just be hidden.
+that recurs one period away in the first image is no evidence for the geometry: where the pattern
+ends, its next period may just be hidden.
 """
 
 from __future__ import annotations
@@ -45,32 +45,32 @@ from .cells import (
 from .image_pair import ImagePair, Pair
 
 DIMENSIONS = 64
-"""Descriptors are reduced to this number of principal components of the first image, which changes
-correlations by less than noise and takes a quarter of the time."""
+"""Descriptors of both images are reduced from 256 to 64 principal components of those of the first
+image, so that correlations take a quarter of the time."""
 
 FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
 """A cell is explained if less than FALSE_POSITIVE_RATE of the cells of displaced copies correlate
-as well. It is contradicted if at least CONTRADICTING_RATE of those have surroundings that correlate
-as well as its own: the limit is looser, because doubt needs less evidence than belief."""
+as well. A cell is contradicted if at least CONTRADICTING_RATE of those cells have surroundings that
+correlate as well as its surroundings: doubt needs less evidence than trust. Chosen by hand."""
 
 FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
 """The second image shifted by plus or minus these fractions of its width and height gives the
 correlations that occur by chance in this pair."""
 
 MIN_PERIOD = 3
-"""Displacements by fewer cells give no copies, because descriptors of nearby cells overlap."""
+"""Copies are displaced by this many cells or more: descriptors of nearer cells overlap."""
 
 MIN_SIMILARITY, MAX_COPIES, MIN_OVERLAP = 0.4, 4, 0.5
 """A displaced copy is compared with a geometry if its correlation over the whole image is at least
-MIN_SIMILARITY times the geometry's, and MIN_OVERLAP of the overlap remains. Planes of Oxford have
-copies of up to 0.3, facades of one repeated window 0.6 or more. At most MAX_COPIES are compared,
-because a lattice has four nearest copies."""
+MIN_SIMILARITY times the geometry's, and MIN_OVERLAP of the overlap remains. Copies reach up to 0.3
+of the geometry's on planes of Oxford, 0.6 or more on facades of one repeated window. At most
+MAX_COPIES are compared, because each point of a lattice has four nearest neighbours."""
 
 MIN_WON, MIN_WON_RATIO = 0.0125, 1.5
 """A geometry must explain at least MIN_WON of its cells clearly better than a displaced copy does,
-and MIN_WON_RATIO times as many as the copy explains better. On facades with one window that is
-unlike the others, the fraction is 0.03 or more, on a truss 0.017; if all windows are alike, up
-to 0.012 for some copy, and 0.002 without the frames of the images."""
+and MIN_WON_RATIO times as many as the copy explains better. The fraction of cells is at least 0.03
+on facades with one odd window, and 0.017 on a truss. On facades whose windows are all alike, it is
+up to 0.012 for some copy."""
 
 MIN_TIED = 0.5
 """A copy competes with a geometry if it explains at least this fraction of the geometry's cells as
@@ -82,14 +82,14 @@ both images are flat and not compared. Places above MIN_GRADIENT in both show mo
 noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
 
 MIN_WINDOWS, MIN_SHARE = 8.0, 0.1
-"""The images confirm a geometry if it explains at least MIN_WINDOWS windows, and MIN_SHARE of the
-cells that can be compared. Geometries of unrelated photographs explain up to 0.07 of them, correct
-ones of long strips in other light 8 windows or more."""
+"""The images confirm a geometry if it explains at least MIN_WINDOWS windows (of 16 cells), and
+MIN_SHARE of the compared cells. Geometries of unrelated photographs explain up to 0.07 of the
+cells. Correct ones of long strips of photographs, in other light, explain 8 windows or more."""
 
 MIN_AGREEMENT, CLEAR_CORRELATION = 0.75, 0.5
 """Two images contradict a geometry if less than MIN_AGREEMENT of their structure agrees with it,
-unless their median correlation is CLEAR_CORRELATION or more: under other light, as by night, the
-rest may differ. Street views 5 m apart, of which only the road fits, reach 0.74 and 0.48."""
+unless their median correlation is CLEAR_CORRELATION or more: in other light, as by night, the rest
+may differ. Street views 5 m apart in which only the road fits have at most 0.74 and 0.48."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +97,11 @@ class Evidence:
     """How well a geometry explains the cells of the first image.
 
     Attributes:
-        similarity: (rows, columns) correlation of each cell with its place; NaN if unknown.
+        similarity: (rows, columns) correlation of each cell with its place in the second image;
+            NaN if unknown.
         bound: correlation above which a cell is explained.
         spread: standard deviation of the correlations of unrelated cells.
-        contradicted: (rows, columns) bool, where not even the surroundings of a cell, on average,
-            are more similar than those of unrelated cells.
+        contradicted: (rows, columns) bool, where a cell's surroundings correlate as by chance.
         structured: (rows, columns) bool, where both images show more than noise.
     """
 
@@ -137,7 +137,7 @@ class Evidence:
 
     @property
     def windows(self) -> float:
-        """Number of explained windows, beyond those that chance explains."""
+        """Number of explained cells beyond those that chance explains, in windows of 16 cells."""
         known = np.isfinite(self.similarity)
         by_chance = FALSE_POSITIVE_RATE * np.count_nonzero(known)
         return float((np.count_nonzero(self.explained) - by_chance) / WINDOW_CELLS)
@@ -254,7 +254,7 @@ class Judge:
 
 
 class View:
-    """The second image in the frame of the first, cell by cell."""
+    """The second image, warped to the frame of the first, compared with it cell by cell."""
 
     def __init__(
         self,
@@ -283,7 +283,7 @@ class View:
             return Evidence(np.full(self._valid.shape, np.nan), 1.0, 1.0, nowhere, nowhere)
         # The median discards copies that happen to be displaced by the period of a pattern.
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # for copies without a cell
+            warnings.simplefilter("ignore", RuntimeWarning)  # copies that overlap no cell
             bounds = [np.nanquantile(each, 1 - FALSE_POSITIVE_RATE) for each in far]
         bound = float(np.nanmedian(bounds))
         own = self._displaced(0, 0)
@@ -332,7 +332,7 @@ class View:
         return False
 
     def _moved(self, image: np.ndarray, valid: np.ndarray, move: np.ndarray) -> np.ndarray:
-        """Correlate the first image with an image that is moved by a homography between cells."""
+        """Correlate the first image with an image moved by a homography in cell coordinates."""
         to_cells = np.array([[1 / CELL_PX, 0, 0], [0, 1 / CELL_PX, 0], [0, 0, 1]])
         to_cells[:2, 2] = -(CELL_PX // 2) / CELL_PX
         matrix, size = np.linalg.inv(to_cells) @ move @ to_cells, image.shape[::-1]
@@ -355,7 +355,7 @@ class View:
         rows, columns = self._valid.shape
         size = cv2.getOptimalDFTSize(2 * rows), cv2.getOptimalDFTSize(2 * columns)
         valid = self._valid.astype(np.float64)
-        some = slice(-24, None)  # these components suffice to find periods
+        some = slice(-24, None)  # the 24 main components suffice to find periods
         first, second = (
             np.fft.rfft2(cells[..., some], size, axes=(0, 1))
             for cells in (self._first, self._second * self._valid[..., None])

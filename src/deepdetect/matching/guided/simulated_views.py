@@ -21,10 +21,10 @@ from ...features.keypoints import Keypoints
 from .image_pair import Pair
 
 BLUR = 0.8
-"""Sigma of the blur before compression, in pixels per sqrt(tilt^2 - 1), as in the paper."""
+"""Sigma of the blur before compression, in pixels per sqrt(tilt^2 - 1), as in ASIFT (2009)."""
 
 ROUNDING = 1e-9
-"""A fraction of a pixel below this is a rounding error, and ignored when sizes are rounded up."""
+"""Image sizes are rounded up, but not for a fraction of a pixel below this rounding error."""
 
 OUTSIDE: dict[str, Any] = {"borderValue": 128}
 
