@@ -18,19 +18,19 @@ TILE_COLUMNS, TILE_HEIGHT = 32, 96
 """Width of a tile of dense SIFT in columns of keypoints, and height in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
-"""Dense SIFT sums this many taps of a filter at a time, so spans are padded to a multiple of it."""
+"""Dense SIFT sums this many filter taps per step; spans of taps are padded to its multiples."""
 
 BINS, RADIUS_PER_WINDOW = 36, 3.0
 """The histogram of gradient directions around a keypoint has BINS bins, as in Lowe (2004). Pixels
 vote up to RADIUS_PER_WINDOW sigmas of the Gaussian window from the keypoint, as in OpenCV."""
 
 CHUNK = 64
-"""Exact search keeps the minimum of every CHUNK distances, so that it finds minima faster."""
+"""Exact search keeps the minimum of each CHUNK distances, which is faster. Chosen by hand."""
 
 
 @compiled(nogil=True, fastmath=True)
 def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, taps, spans, out):  # type: ignore[no-untyped-def]
-    """Write the descriptors of the keypoints in tiles `first` to `last` (exclusive) into `out`.
+    """Write SIFT descriptors of the keypoints in tiles `first` to `last` (exclusive) into `out`.
 
     `magnitude` and `orientation` come from `sift_gradient`. Keypoints lie on a lattice of points
     that are `step` pixels apart; the first is the pixel `origin`, (x, y). `rows_of` holds for each
@@ -148,9 +148,9 @@ def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
-    """Find, for each position, the nearest of (M, 2) keypoints in the 3x3 pixels around it.
+    """Find, for each position, the nearest of (M, 2) keypoints, `xy`, in the 3x3 pixels around it.
 
-    `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. Nothing is written into
+    `grid`, (H, W), holds the row in `xy` of each pixel's keypoint, or -1. Nothing is written into
     `nearest` for positions that are not finite, or that have no keypoint in these pixels.
     """
     height, width = grid.shape
@@ -264,7 +264,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
     """Improve the two best matches of each query in the bands `first` to `last` (exclusive).
 
     `bands` holds the index of the first query in each band; queries are in row-major order. `at0`
-    and `at1` hold the row of the keypoint at each pixel of the two images, or -1. `turn` is the
+    and `at1` hold the index of the keypoint on each pixel of the two images, or -1. `turn` is the
     number of the sweep: even sweeps go down the image, odd ones up. Two kinds of candidates are
     tried for a query: the matches of the queries at `offsets` from it, shifted by the offset, and
     random keypoints within `radii` around its best match. For a query of another band, its match
@@ -349,7 +349,7 @@ ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-"""Coefficients of OpenCV's arctangent, in degrees, so that votes go to OpenCV's bins."""
+"""Coefficients of OpenCV's arctangent polynomial, in degrees: votes go to the same bins."""
 
 
 @compiled(nogil=True, error_model="numpy")

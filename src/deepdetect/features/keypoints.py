@@ -39,8 +39,8 @@ class Keypoints:
     Attributes:
         xy: (N, 2) float32 positions in pixels, x to the right and y down; the centre of the first
             pixel is (0, 0).
-        scores: (N,) float32, higher is better. Those of a `PointDetector` lie in (0, 1) and all
-            differ. Those of `DeepDetect` are probabilities; float32 rounds the highest to 1, so
+        scores: (N,) float32, higher is better. Scores of a `PointDetector` lie in (0, 1) and all
+            differ. Scores of `DeepDetect` are probabilities; float32 rounds the highest to 1, so
             `best` ranks by logits.
         image_size: (width, height) of the image in pixels.
         logits: (N,) float32 logits of the probabilities, or None.
@@ -247,7 +247,7 @@ class Keypoints:
 
     @suggest_keywords
     def best(self, count: int) -> Keypoints:
-        """Return the `count` best keypoints, in their present order.
+        """Return the `count` best keypoints, in the order in which they are stored.
 
         Keypoints are ranked by logits or, without these, by scores. Ties are broken so that the
         chosen keypoints are spread evenly over the image.
@@ -259,7 +259,7 @@ class Keypoints:
         return self[np.sort(np.lexsort((order, -ranks))[:count])]
 
     def distinct(self) -> Keypoints:
-        """Keep only the best keypoint at each position: SIFT repeats a position for each angle."""
+        """Keep the best keypoint at each position: SIFT repeats a position for each orientation."""
         order = np.argsort(-self.scores, kind="stable")
         # Comparing x and y as one number is ten times faster than rows; + 0 turns -0 into 0.
         keys = np.ascontiguousarray(self.xy[order] + np.float32(0)).view(np.uint64).ravel()
@@ -311,7 +311,7 @@ def unit_length(descriptors: np.ndarray) -> np.ndarray:
 
 
 def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Rank (N, 2) positions so that the first of them, however many, are spread evenly.
+    """Rank (N, 2) positions so that those of the lowest ranks, however many, are spread evenly.
 
     The ranks, (N,) float32 in [0, 1), are values of a Bayer matrix (ordered dithering) that covers
     an image of this (width, height), at the pixels nearest to the positions.
@@ -331,7 +331,7 @@ def nearest_keypoints(
     """Find the keypoint nearest to each of (N, 2) positions, within the 3x3 pixels around it.
 
     If several keypoints lie on one pixel, only the first is used. Returns (N,) int32 rows of `xy`
-    and (N,) distances in pixels: -1 and infinity if no keypoint is near.
+    and (N,) distances in pixels; -1 and infinity without a keypoint in these pixels.
     """
     from .kernels import nearest_of_nine
 

@@ -9,7 +9,7 @@ import numpy as np
 from .._shared.opencv import cv2
 
 LAYERS = 3
-"""Number of layers with keypoints per octave (Lowe, 2004). Sigma grows by 2^(1/3) per layer."""
+"""Number of layers of keypoints per octave (Lowe, 2004); each multiplies sigma by 2^(1/3)."""
 
 BASE_SIGMA_PX, CAMERA_SIGMA_PX = 1.6, 0.5
 """BASE_SIGMA_PX is the sigma of an octave's first image, in the octave's pixels. CAMERA_SIGMA_PX is
@@ -38,7 +38,7 @@ def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarra
 
 
 def packed_octaves(sizes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return octave and layer of keypoints with (N,) sizes, packed into (N,) int64 as in OpenCV."""
+    """Return octaves and layers of (N,) keypoint sizes, packed into (N,) int64 as in OpenCV."""
     octaves, layers = nearest_layers(sizes, shape)
     return (octaves & 255) | (layers << 8)
 
@@ -49,7 +49,7 @@ def gaussian_layers(
     """Yield the images of the scale space from fine to coarse, as (octave, layer, image).
 
     Images are (H, W) float32. The pixel (x, y) of octave o lies at (2^o x, 2^o y) in `gray`. Layers
-    go from 0 to 3.
+    are numbered from 0 to 3.
     """
     image = gray.astype(np.float32)
     sigma = CAMERA_SIGMA_PX
@@ -97,7 +97,7 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
 def set_angles(
     gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray, angles: np.ndarray | None
 ) -> np.ndarray:
-    """Return (N,) float32 angles, with unset ones (below 0, or None) set to the dominant angles."""
+    """Return (N,) float32 angles in degrees; dominant ones replace None and those below 0."""
     angles = np.full(len(xy), -1, np.float32) if angles is None else angles.copy()
     unset = np.flatnonzero(angles < 0)
     angles[unset] = dominant_angles(gray, xy[unset], sizes[unset])

@@ -17,16 +17,16 @@ MAX_OFFSET_PX = 0.499
 """Maximum sub-pixel shift in x and in y: below 0.5, so that the nearest pixel stays the same."""
 
 Rows = Callable[[slice], np.ndarray]
-"""A function that returns the requested rows of a map."""
+"""A function that returns the rows of an (H, W) map that a slice selects."""
 
 BAND_PIXELS = 4_000_000
-"""Maps are processed in bands of rows with about this many pixels, to limit the memory."""
+"""Maps are processed in bands of about this many pixels, to limit memory. Chosen by hand."""
 
 GRID_CELLS = 24
 """Number of cells of `spread_over_grid` along the longer side of the image. Chosen by hand."""
 
 DISTANCE_STEP_PX = 0.25
-"""Precision of the largest distance that `spread_by_distance` finds. Chosen by hand."""
+"""Precision, in pixels, to which `spread_by_distance` searches its distance. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class SelectionOptions:
     """Which pixels of a heat map become keypoints.
 
     Attributes:
-        threshold: pixels with a higher probability become keypoints (paper: tau = 0.5).
+        threshold: pixels with a probability above this become keypoints (DeepDetect paper: 0.5).
         density: keypoints per pixel, in (0, 1]. If set, the threshold is not used: the most
             probable pixels are taken, up to this fraction of all pixels.
         max_keypoints: maximum number of keypoints; the most probable ones are kept.
@@ -237,7 +237,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
     in_bands = list(bands(ranking.shape))
-    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # a single band is computed once
+    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # computed once for both loops
     lowest = np.float32(-np.inf)
     if count is not None:
         parts = (ranks[wanted(rows) if only is None else only] for rows in in_bands)
@@ -263,7 +263,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
 
 
 def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) -> np.floating:
-    """Return the `count`-th highest value of all parts; -infinity if there are fewer values."""
+    """Return the `count`-th highest value in all arrays; -infinity if they hold fewer."""
     if count == 0:  # the density asks for less than half a keypoint
         return kind.type(np.inf)
     best = np.empty(0, kind)
@@ -351,7 +351,7 @@ def without_frame(rgb: np.ndarray, ignore: np.ndarray | None) -> np.ndarray | No
 
 
 def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:
-    """Choose one random position in each grid cell; return the chosen rows of `xy`, ascending."""
+    """Choose a random position in each square of a grid; return the rows of `xy`, ascending."""
     cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
     order = np.random.default_rng(seed).permutation(len(cell))
     _, first = np.unique(cell[order], axis=0, return_index=True)
