@@ -13,14 +13,14 @@ import numpy as np
 from .._shared.machine import parallel_for
 
 MAX_ITERATIONS = 15
-"""An alignment of a patch takes at most this number of steps. Chosen by hand."""
+"""Maximum number of Gauss-Newton steps for a patch. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
 """A patch has converged only if its correlation is at least this. Chosen by hand."""
 
 RIDGE = 1e-3
-"""If the affinity is free, this multiple of the mean squared gradient is added to the diagonal of
-the normal equations, which are singular for a patch of parallel edges. Chosen by hand."""
+"""If affinities are also estimated, this multiple of the mean squared gradient is added to the
+normal equations' diagonal: they are singular for a patch of parallel edges. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Alignment:
     Attributes:
         radius_px: the side of a patch is 2 * radius + 1 pixels, and its pixels have Gaussian
             weights with a sigma of radius / 2.
-        max_shift_px: a patch may move by at most this distance.
-        convergence_px: the alignment ends at a step shorter than this.
-        affine: whether the affinity is adapted too, not only the position.
+        max_shift_px: maximum distance of a patch from its initial position.
+        convergence_px: a patch has converged after a step shorter than this.
+        affine: whether the affine map of a patch is estimated, and not only its position.
         cubic: whether values between pixels are interpolated by Keys's cubic; otherwise bilinearly,
             which takes half of the time and is as exact in blurred images.
     """
@@ -51,7 +51,7 @@ class Aligned:
     Attributes:
         points1: (N, 2) float64 positions in the second image.
         correlations: (N,) float32 correlations of the patches; 0 if a patch did not converge.
-        affinities: (N, 2, 2) float64, from the first image to the second.
+        affinities: (N, 2, 2) float64 linear maps of the patches from the first image to the second.
         covariances: (N, 2, 2) float64 covariances of `points1` in square pixels, from the
             differences of the patches, as if the noise of their pixels were independent.
     """
@@ -78,7 +78,7 @@ def align_patches(
 
     The images are (H, W) float32. `points0` are the centres of the patches, (N, 2), `start` their
     initial positions in the second image, (N, 2), and `affinities` is (N, 2, 2). A patch does not
-    converge if it is flat, crosses the border, moves too far or stays too different.
+    converge if it is flat, crosses the border, moves too far or correlates below `MIN_CORRELATION`.
     """
     from .alignment_kernel import align
 

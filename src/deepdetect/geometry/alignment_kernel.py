@@ -52,7 +52,7 @@ def _read(image, x, y, a, b, c, d, radius, cubic, values):  # type: ignore[no-un
 
 @compiled(nogil=True, fastmath=True)
 def _inverted(matrix, inverse, size):  # type: ignore[no-untyped-def]
-    """Write the inverse of a positive definite matrix by Gauss and Jordan; change the matrix."""
+    """Write a positive definite matrix's inverse (Gauss-Jordan), overwriting the matrix."""
     for row in range(size):
         for column in range(size):
             inverse[row, column] = 1.0 if row == column else 0.0
@@ -73,7 +73,7 @@ def _inverted(matrix, inverse, size):  # type: ignore[no-untyped-def]
 def _prepare(image, x0, y0, weight, radius, free, ridge, cubic, ring, template, slope, inverse):  # type: ignore[no-untyped-def]
     """Write a patch without its mean, its derivatives, and the inverse of their normal matrix.
 
-    Returns the variance of the patch; 0 if the patch does not tell its position.
+    Returns the variance of the patch; 0 if the patch is flat or shows only parallel edges.
     """
     side = 2 * radius + 1
     count, wide = side * side, side + 2
@@ -92,7 +92,7 @@ def _prepare(image, x0, y0, weight, radius, free, ridge, cubic, ring, template, 
                 slope[2, j], slope[3, j] = slope[0, j] * across, slope[0, j] * down
                 slope[4, j], slope[5, j] = slope[1, j] * across, slope[1, j] * down
             j += 1
-    # Subtracting the means eliminates the offset. The gain is eliminated in the next loop.
+    # Means are subtracted to eliminate the offset of the brightness; the next loop does the gain.
     tt = np.float32(0)
     for j in range(count):
         template[j] -= mean
@@ -147,10 +147,10 @@ def align(  # type: ignore[no-untyped-def]
     """Align the patches `first` to `last - 1` of the first image to the second.
 
     The method is inverse compositional: the derivatives of the patch of the first image and the
-    normal matrix are computed only once for each match. With `free` = 2, only the position is free,
-    with 6 also the affinity, which is then updated. `aligned`, `correlations` and `covariances` are
-    written; the correlation of a patch that does not converge is 0. The covariance (xx, xy, yy) is
-    that of one independent noisy pixel: the caller divides it by their number. See
+    normal matrix are computed only once for each match. With `free` = 2, only the position is
+    estimated, with 6 also the affinity, in place. `aligned`, `correlations` and `covariances` are
+    written; the correlation of a patch that does not converge is 0. The caller divides the
+    covariance (xx, xy, yy) by the number of independent pixels in a patch. See
     `alignment.align_patches` for the other arguments.
     """
     side = window.shape[0]
@@ -198,7 +198,7 @@ def align(  # type: ignore[no-untyped-def]
             if ts <= 0:
                 break
             gain = ts / tt
-            # Slopes and template are orthogonal, so the step depends only on gain times shift.
+            # Slopes are orthogonal to the template, so `error` depends only on gain times shift.
             for one in range(free):
                 step[one] = 0
             for one in range(free):

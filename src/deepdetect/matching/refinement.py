@@ -19,34 +19,34 @@ from ..geometry.transforms import homography_derivatives
 from ..io.image import load_image, luma
 
 ALIGNMENT = Alignment(radius_px=7, max_shift_px=3.0, convergence_px=0.03, affine=True, cubic=False)
-"""How matches are aligned. With 2,048 points, 827 mutual matches per pair of Oxford and 381 of
-HPatches are then within 1 px; before, 722 and 309. A radius of 10 px gives 848 and 395, but worse
-poses of a KITTI clip than one of 7 px (AUC at 1 degree 0.646 for 0.659, in trials)."""
+"""How matches are aligned. Among mutual matches of 2,048 points, 827 per pair of Oxford and 381 per
+pair of HPatches are within 1 px after alignment, 722 and 309 before. A radius of 10 px gives 848
+and 395, but in trials a pose AUC at 1 degree of 0.646 on a KITTI clip, where 7 px gave 0.659."""
 
 BASE_SIGMA_PX = 0.8
-"""Both images are blurred at least by this sigma, since bilinear interpolation needs it."""
+"""Minimum sigma of the blur of both images, which bilinear interpolation needs."""
 
 SIGMAS_PX = 0.7, 1.0, 1.5, 2.0, 3.0
-"""The sharper of two images is blurred further, as the other one was: by the sigma of these with
-which the patches correlate best, or not at all. A wrong sigma moves matches by up to half of it."""
+"""The sharper image of a pair is blurred by one of these sigmas, or not at all: that with which a
+sample of patches correlates best. A wrong blur moves matches by up to half a pixel."""
 
 SAMPLE = 128
-"""Number of evenly chosen matches by which the blur is found. Chosen by hand."""
+"""Number of matches, evenly drawn, whose patches choose the blur. Chosen by hand."""
 
 CERTAIN = 0.95
-"""Matches with a correlation of at least this are not tried with another first affinity."""
+"""Matches that correlate at least this well try no other initial affinity. Chosen by hand."""
 
 MIN_SIGMA_PX = 0.05
 """Minimum standard deviation of an aligned position along each axis. Chosen by hand."""
 
 POINT_SIGMA_PX, PIXEL_SIGMA_PX = 1.0, 0.35
-"""Standard deviation along each axis of a match before refinement: of keypoints with sizes, and of
-whole pixels, where rounding alone causes 0.29. Alignments are averaged with what was known before,
-so that a patch that shows only an edge moves across it. 0.58 to 0.70 of the guided matches of four
-pairs of Oxford are within 0.5 px, and 0.73 to 0.92 of them after refinement."""
+"""Standard deviation along each axis of unrefined matches: of keypoints with sizes, and of those on
+whole pixels (rounding alone causes 0.29). An aligned position is averaged with the unrefined one,
+so that a patch that shows only an edge moves only across the edge. On four pairs of Oxford,
+0.58 to 0.70 of guided matches are within 0.5 px before refinement, 0.73 to 0.92 after it."""
 
 MAX_DEVIATIONS = 3.0
-"""An alignment is rejected if it moves a match by more than this number of standard deviations."""
+"""An alignment is rejected if it moves a match by this many deviations. Chosen by hand."""
 
 
 @suggest_keywords
@@ -56,8 +56,8 @@ def refine_matches(
 ) -> Matches:
     """Move the ends of matches in the second image to a fraction of a pixel.
 
-    The patch around each match in the first image is aligned to the second image under an affine
-    map and a gain and offset of the brightness, after the sharper image is blurred as the other.
+    The sharper image is blurred like the other. Then the patch around each match in the first image
+    is aligned to the second under an affine map and a gain and offset of the brightness.
 
     Args:
         image0, image1: the images of the matches, anything `load_image` takes.
@@ -67,8 +67,8 @@ def refine_matches(
 
     Returns:
         The same matches, with new `points1` and with `covariances`. A match that cannot be aligned,
-        for example since the images differ too much there, keeps its position, and has the standard
-        deviation of matches before: 1 pixel, or 0.35 pixels if the keypoints are whole pixels.
+        for example since the images differ too much there, keeps its position, with the standard
+        deviation of unrefined matches: 1 pixel, or 0.35 pixels for keypoints without sizes.
         Matches of a rectified pair (`Matches.subpixel`) are returned as they are.
 
     Raises:
@@ -104,7 +104,7 @@ def refine_matches(
     starts = [*_first_affinities(matches)]
     sigmas = _sigmas(grays, points0, points1, starts)
     found = _aligned(grays, sigmas, points0, points1, starts)
-    # Noise of pixels that are blurred by a Gaussian is correlated within 4 pi sigma^2 pixels.
+    # After a Gaussian blur, the noise of 4 pi sigma^2 pixels counts as one independent value.
     correlated = 4 * np.pi * (BASE_SIGMA_PX**2 + max(sigmas) ** 2)
     measured = correlated * found.covariances + MIN_SIGMA_PX**2 * np.eye(2)
     exact = PIXEL_SIGMA_PX if matches.keypoints1.sizes is None else POINT_SIGMA_PX
@@ -119,7 +119,7 @@ def refine_matches(
 
 
 def _first_affinities(matches: Matches) -> Iterator[np.ndarray]:
-    """Yield (M, 2, 2) affinities with which to begin: of the geometry, the keypoints, none."""
+    """Yield (M, 2, 2) initial affinities: of a homography or none, then of sizes and angles."""
     geometry, count = matches.geometry, len(matches)
     if geometry is not None and geometry.model == "homography" and geometry.matrix is not None:
         yield homography_derivatives(matches.points0, geometry.matrix)
