@@ -25,7 +25,7 @@ BINS, RADIUS_PER_WINDOW = 36, 3.0
 vote up to RADIUS_PER_WINDOW sigmas of the Gaussian window from the keypoint, as in OpenCV."""
 
 CHUNK = 64
-"""Exact search keeps the minimum of each CHUNK distances, which is faster. Chosen by hand."""
+"""Exact search keeps one minimum per CHUNK distances, to find minima faster. Chosen by hand."""
 
 
 @compiled(nogil=True, fastmath=True)
@@ -349,7 +349,7 @@ ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-"""Coefficients of OpenCV's arctangent polynomial, in degrees: votes go to the same bins."""
+"""Coefficients of OpenCV's arctangent polynomial in degrees, so that votes go to its bins."""
 
 
 @compiled(nogil=True, error_model="numpy")

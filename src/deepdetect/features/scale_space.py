@@ -97,7 +97,7 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
 def set_angles(
     gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray, angles: np.ndarray | None
 ) -> np.ndarray:
-    """Return (N,) float32 angles in degrees; dominant ones replace None and those below 0."""
+    """Return (N,) float32 degrees; unset angles (below 0, or None) become the dominant ones."""
     angles = np.full(len(xy), -1, np.float32) if angles is None else angles.copy()
     unset = np.flatnonzero(angles < 0)
     angles[unset] = dominant_angles(gray, xy[unset], sizes[unset])

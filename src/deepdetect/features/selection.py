@@ -351,7 +351,7 @@ def without_frame(rgb: np.ndarray, ignore: np.ndarray | None) -> np.ndarray | No
 
 
 def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:
-    """Choose a random position in each square of a grid; return the rows of `xy`, ascending."""
+    """Choose a random position in each grid cell; return their rows of `xy`, ascending."""
     cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
     order = np.random.default_rng(seed).permutation(len(cell))
     _, first = np.unique(cell[order], axis=0, return_index=True)

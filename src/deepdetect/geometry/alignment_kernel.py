@@ -92,7 +92,7 @@ def _prepare(image, x0, y0, weight, radius, free, ridge, cubic, ring, template, 
                 slope[2, j], slope[3, j] = slope[0, j] * across, slope[0, j] * down
                 slope[4, j], slope[5, j] = slope[1, j] * across, slope[1, j] * down
             j += 1
-    # Means are subtracted to eliminate the offset of the brightness; the next loop does the gain.
+    # Subtracting the means eliminates the brightness offset. The loop below eliminates the gain.
     tt = np.float32(0)
     for j in range(count):
         template[j] -= mean

@@ -46,7 +46,7 @@ so that a patch that shows only an edge moves only across the edge. On four pair
 0.58 to 0.70 of guided matches are within 0.5 px before refinement, 0.73 to 0.92 after it."""
 
 MAX_DEVIATIONS = 3.0
-"""An alignment is rejected if it moves a match by this many deviations. Chosen by hand."""
+"""An alignment that moves a match by this many standard deviations is rejected. Set by hand."""
 
 
 @suggest_keywords

@@ -100,7 +100,7 @@ def gathered(
 
 
 def mean_gradient(gray: np.ndarray) -> np.ndarray:
-    """Return the mean gradient around each pixel, as the difference of pixels two apart."""
+    """Return the mean gradient, a difference of pixels two apart, in 24 x 24 pixels around each."""
     side = 3 * round(WINDOW_CELLS**0.5) * CELL_PX // 2
     return cv2.boxFilter(sift_gradient(gray)[0], -1, (side, side))
 

@@ -250,7 +250,7 @@ class Explanation:
         return Layer(exact, matches, evidence, tracks, evidence.confirms and view.repeated)
 
     def _apart(self, flats: Sequence[Hypothesis], epipolar: Hypothesis) -> Hypothesis:
-        """Return the geometry of the matches off a plane that moves on its own, or `epipolar`."""
+        """Return the matrix of the matches off a plane that moves on its own; else `epipolar`."""
         for plane in flats:
             tentative = plane.tentative
             off = plane.errors(tentative.points0, tentative.points1) > 2 * plane.threshold_px
@@ -325,7 +325,7 @@ class Explanation:
         return max(MIN_MATCHED_FRACTION * min(len(xy) for xy in self.pixels), MIN_MATCHES)
 
     def answer(self) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-        """Return the geometry of the first layer, and the matches of all."""
+        """Return the geometry of the first layer, and the matches of all layers."""
         tried = len(self.tried.points0)
         if not self.layers:
             evidence = PublicEvidence(tried, 0, self.best_nfa, self.tried.views)
@@ -411,7 +411,7 @@ class Explanation:
 
 
 def stands_still(homography: np.ndarray, sizes: tuple[Size, Size]) -> bool:
-    """Return whether a homography between images of one size moves nothing."""
+    """Return whether a homography moves no corner of equal-sized images by `MAX_STILL`."""
     corners = outer_corners(sizes[0])
     motion = transfer_errors(corners, corners, homography)
     return sizes[0] == sizes[1] and bool(motion.max() < MAX_STILL * max(sizes[0]))
