@@ -59,7 +59,7 @@ direction agrees with a given epipole with a probability of 0.16. Limits are cho
 
 SURE_SHARE = 0.28
 """A scene also has depth if this share of all tracks is off the plane and agrees with one epipole.
-The share is at most 0.23 on planes of Oxford, 0.32 on entry 1-3 and 0.42 on Middlebury's cloth."""
+Planes of Oxford have at most 0.23, Strecha's entry 1-3 has 0.32, Middlebury's cloth has 0.42."""
 
 FAR = 3.0
 

@@ -42,13 +42,13 @@ MAX_NEARBY_LOG10_NFA = -3.0
 """Sparse matches without dense ones suffice if the log10 NFA of their geometry is below
 HIGH_LOG10_NFA, and that among nearby matches (`log10_nfa_nearby`) below this. Still matches do not
 count: descriptors see frames and image borders. In 40 sparse answers of all test sets, wrong ones
-have -2.3 or more among nearby matches; right ones of ten wide baselines have -4.3 or less."""
+have -2.3 or more among nearby matches; right ones with wide baselines have -4.3 or less."""
 
 MIN_KEPT = 0.8
 """Depth also wins over a plane if it explains this fraction of the plane's cells both compare."""
 
 OFF_RATIO = 4.0
-"""Further geometries use matches that miss all earlier ones by this many inlier thresholds."""
+"""A further geometry is fitted to matches this many inlier thresholds off all earlier ones."""
 
 MIN_CHOSEN = 0.75
 """If this fraction of the tentative matches agrees with a plane, the plane is accepted although a

@@ -35,7 +35,7 @@ DENSE_SIDE_PX, DENSE_KEYPOINTS = 1280, 8192
 the 796 right answers for the 1,050 test pairs of `lab/acceptance`."""
 
 GIVEN_SIDE_PX = 1200
-"""Given matches are taken to be as exact as in images of this longer side. Chosen by hand."""
+"""Matches that the caller gives are assumed to be as exact as in images of this longer side."""
 
 VIEWED_SIDE_PX, VIEWED_KEYPOINTS = 320, 1000
 """Each image, with this longer side and number of points, is compared with 8 oblique views of the
