@@ -263,7 +263,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """
     folder = cli.output_folder(output)
     how = SHARDS_RUN.take(values)
-    # Shards do not depend on the stages: the crops of this one are small enough for any view.
+    # A recipe needs a stage, but shards do not depend on it. Crops of 16 pixels fit into any view.
     recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
     made = write_shards(images, folder, recipe, quiet=False, **how)
     return cli.Result(

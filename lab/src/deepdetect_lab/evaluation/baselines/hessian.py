@@ -25,7 +25,7 @@ DISTANCE_PX = 2.0
 """Keypoints of equal or different scales are at least this far apart. Chosen by hand."""
 
 SIZE_PER_SIGMA = 5.0
-"""The size (diameter) of a keypoint is 5 times the sigma at which it was found."""
+"""Diameter of a keypoint, divided by the sigma of its scale. Chosen by hand."""
 
 
 def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:

@@ -63,7 +63,7 @@ DENSE_NOTE = (
 
 
 CELL_PX = 4
-"""Side in pixels of the cells in which clouds are compared: some use only every second pixel."""
+"""Clouds are compared in image squares of this side: some skip every second pixel."""
 
 CLOUD_COLUMNS = {
     "cloud": "",

@@ -123,7 +123,7 @@ class SfmMethod:
     `find` writes the keypoints of a folder of images to a file, and `match` returns the matches of
     image pairs. Both functions must be module-level, because another process runs them. `name` and
     `version` identify cached results. If `chance` is set, the time of `find` is not reported. If
-    `refined` is set, COLMAP's tracks are refined. `tracks` is the value of the option `matches`.
+    `refined` is set, COLMAP's tracks are refined. `tracks` is `MultiViewOptions.matches`.
     """
 
     name: str
