@@ -126,7 +126,7 @@ class Run:
         except (CacheError, OptionError):
             raise
         except (DeepDetectError, cv2.error) as error:
-            reason = getattr(error, "err", None) or error  # without OpenCV's file names
+            reason = getattr(error, "err", None) or error  # `err` lacks OpenCV's file names
             self.fail(f"{name}: {first_line(reason)}")
             return None
 

@@ -124,7 +124,7 @@ class CropSampler(Sampler[list[CropIndex]]):
         return batch
 
 
-@functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs
+@functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs at a time
 def epoch_order(
     seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
 ) -> np.ndarray:

@@ -20,7 +20,7 @@ WHITE = 255
 """The highest grey level of an 8-bit image."""
 
 MIDDLE_GREY = 0.5
-"""Contrast is changed around this value of [0, 1], so that the mean brightness hardly changes."""
+"""Contrast is scaled around this value of [0, 1], so that the mean brightness hardly changes."""
 
 NOISE_CELLS = (2, 5)
 """Smooth changes of light are interpolated from 2 to 4 random values along a side of the view. So

@@ -49,11 +49,11 @@ class Photographs:
         return [pair for scene in load_posed_scenes(self.data) for pair in scene.pairs]
 
     def any(self, rng: np.random.Generator, size: tuple[int, int] = SIZE) -> np.ndarray:
-        """Return a random photograph of `others`, scaled to `size` (width, height)."""
+        """Return a random photograph from the list `others`, scaled to `size` (width, height)."""
         return resized(load_image(self.others[rng.integers(len(self.others))]), size)
 
     def unlike(self, rng: np.random.Generator) -> list[np.ndarray]:
-        """Return two different photographs of `others`, scaled to `SIZE`."""
+        """Return two different photographs from the list `others`, scaled to `SIZE`."""
         two = rng.choice(len(self.others), 2, replace=False)
         return [resized(load_image(self.others[number]), SIZE) for number in two]
 

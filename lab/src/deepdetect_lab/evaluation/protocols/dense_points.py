@@ -170,7 +170,7 @@ def measure_dense_points(
 
 
 def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> Row:
-    """Compare the two depth maps in each pair; `name` begins the column titles of the result."""
+    """Compare the depth maps of each pair; `name` begins the column titles of the result."""
     differences = []
     for first, second in pairs:
         both = np.isfinite(first) & np.isfinite(second)

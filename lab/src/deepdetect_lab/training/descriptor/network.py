@@ -107,7 +107,7 @@ class KeypointNetwork(nn.Module):
         nn.init.zeros_(self.get_parameter("by_size.2.bias"))
         self.norm, self.middle_norm = nn.BatchNorm1d(hidden), nn.BatchNorm1d(hidden)
         self.middle, self.output = nn.Linear(hidden, hidden), nn.Linear(hidden, LENGTH)
-        self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # log(1 / t) in the loss
+        self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # log of 1 / temperature
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return the feature maps of each octave."""

@@ -163,7 +163,7 @@ class DescriptorTrainer(Trainer):
         return load_network(init_weights, self.kind_of_network)
 
     def rate_factor(self, name: str) -> float:
-        """Return the factor of the learning rate of a parameter."""
+        """Return the factor by which the learning rate is multiplied for a parameter."""
         return 1.0
 
     def dataset(self) -> Dataset[Any]:

@@ -58,7 +58,7 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
 def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
     """Return selection probabilities (N,), 0 where a close candidate has a larger logit."""
     logits = ranker(torch.from_numpy(view.features))
-    radii = least_distances(view.sigma_px)  # the same as in detection
+    radii = least_distances(view.sigma_px)  # the same distances as in detection
     kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))
     fixed = logits[kept].detach()
     spread = fixed.std() if len(fixed) > 1 else fixed.new_ones(())
