@@ -117,7 +117,7 @@ def chosen_recipe(
     labels = chosen_label_settings(detectors, label_settings)
     if label_settings is not None:
         values["labels"] = labels
-    elif detectors is not None:  # keeps the preset's settings of these detectors
+    elif detectors is not None:  # their settings stay the preset's
         values["labels"] = recipe.labels.with_detectors(labels.detectors)
     return replace(recipe, **values)
 
@@ -263,7 +263,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """
     folder = cli.output_folder(output)
     how = SHARDS_RUN.take(values)
-    # Shards do not depend on the stages: the crops of this one are small enough for any view.
+    # A recipe needs a stage, but shards do not depend on it. Crops of 16 pixels fit into any view.
     recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
     made = write_shards(images, folder, recipe, quiet=False, **how)
     return cli.Result(

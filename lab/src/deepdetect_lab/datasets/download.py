@@ -24,7 +24,7 @@ from deepdetect.io.image import find_images
 from deepdetect.io.image_file import IMAGE_SUFFIXES
 
 CHUNK_BYTES = 1 << 16
-"""Downloads are written in blocks of this size, so that an interruption loses at most one block."""
+"""Downloads are written in blocks of this many bytes. An interruption loses at most one block."""
 
 TIMEOUT_SECONDS = 60.0
 """A host is given up if it sends no bytes for this time. Chosen by hand; not measured."""
@@ -277,7 +277,7 @@ def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet:
         _check(dataset, unfinished, "the download")
     except DeepDetectError:
         shutil.rmtree(unfinished)
-        for path in paths:  # otherwise the next call would use the same wrong files
+        for path in paths:  # the next call would use the same wrong files again
             path.unlink()
         raise
     if final.exists():

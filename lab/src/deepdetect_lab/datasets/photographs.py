@@ -32,7 +32,7 @@ from .download import RemoteFile
 
 CROP_SIDE_PX = 480
 JPEG_QUALITY = 97
-"""Labels hardly change at this JPEG quality: compression errors are smaller than image noise."""
+"""JPEG quality of the crops: its errors are smaller than image noise, so labels hardly change."""
 
 VALIDATION_SHARE = 1 / 20
 

@@ -33,10 +33,10 @@ from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 MAX_ROTATION_ERROR = 1e-3
-"""Tolerance for R R^T = I in rotation matrices R that were read, since files have few digits."""
+"""Tolerance for R R^T = I in rotation matrices R from files with few digits. Chosen by hand."""
 
 MAX_ASPECT_ERROR = 0.01
-"""Image and camera may differ by this fraction in aspect ratio, since sizes are rounded."""
+"""Aspect ratios of image and camera may differ by this fraction (rounding). Chosen by hand."""
 
 COLMAP_FILES = ("images.bin", "images.txt")
 

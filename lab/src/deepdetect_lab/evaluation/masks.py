@@ -282,7 +282,7 @@ class LabelDensityDetector:
 
     def __init__(self, detector: DeepDetect) -> None:
         self.detector = detector
-        seen = HeatmapOptions(detector.heatmap_options.resolution)  # without the option `tta`
+        seen = HeatmapOptions(detector.heatmap_options.resolution)  # labels need no `tta`
         self.labels = LabelDetector(heatmap_options=seen)
 
     def heatmap(self, image: Any) -> np.ndarray:

@@ -108,7 +108,7 @@ class Run:
 
     @cached_property
     def files_folder(self) -> Path:
-        """Folder for generated images: the cache folder, or a temporary folder without a cache."""
+        """Folder for generated images: the cache folder; without a cache, a temporary folder."""
         if self.cache is not None:
             return self.cache
         folder = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
@@ -126,7 +126,7 @@ class Run:
         except (CacheError, OptionError):
             raise
         except (DeepDetectError, cv2.error) as error:
-            reason = getattr(error, "err", None) or error  # without OpenCV's file names
+            reason = getattr(error, "err", None) or error  # `err` lacks OpenCV's file names
             self.fail(f"{name}: {first_line(reason)}")
             return None
 

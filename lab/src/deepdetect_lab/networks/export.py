@@ -122,7 +122,7 @@ def fold_normalisation(graph: GraphProto) -> None:
     values = {one.name: one for one in graph.initializer}
     made = {name: node for node in graph.node for name in node.output}
     for node in graph.node:
-        if node.op_type == "Identity" and node.input[0] in values:  # equal weights stored once
+        if node.op_type == "Identity" and node.input[0] in values:  # equal weights, stored once
             values[node.output[0]] = values[node.input[0]]
     folded: list[NodeProto] = []
     for node in graph.node:

@@ -20,7 +20,7 @@ from torch.nn.functional import (
 )
 
 HALF, QUARTER, EIGHTH = 16, 32, 40
-"""Numbers of channels at 1/2, 1/4 and 1/8 of the image size: fewest where layers take most time."""
+"""Numbers of channels at 1/2, 1/4 and 1/8 of the image size: fewest where layers are slowest."""
 
 RED, GREEN, BLUE = 9798, 19235, 3735
 """Weights of red, green and blue in the luma (BT.601), in units of 1/32,768, as in OpenCV."""

@@ -61,7 +61,7 @@ CAMERA = Camera(blur=Effect(0.3, 0.5, 2.5), noise=(Effect(0.25, 1, 8),), jpeg=Ef
 
 READ_NOISE, SHOT_NOISE = (math.log(0.5), math.log(14.0)), (0.0, 1.0)
 """Ranges of a sensor's noise: log of the read noise's standard deviation in grey levels, and the
-variance that shot noise adds per grey level. A phone at night has about 8 (not its log) and 0.5."""
+variance that shot noise adds per grey level. They are about log(8) and 0.5 on a phone at night."""
 
 MAX_JITTER_SATURATION = 1.2
 """A hue rotation also scales the saturation by a random factor up to this one. Chosen by hand."""

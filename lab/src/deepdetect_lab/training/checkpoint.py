@@ -18,7 +18,7 @@ from deepdetect._shared.records import key
 from ..networks.weights import save_tensors
 
 Point = dict[str, float]
-"""A point of the training curves: the losses and measures after some step, by name."""
+"""A point of the training curves: losses and measures, by name, after a number of steps."""
 
 
 def save_checkpoint(

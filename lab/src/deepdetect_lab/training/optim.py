@@ -15,7 +15,7 @@ BETA = 0.95
 
 EPS = 1e-8
 PRECONDITION_FREQUENCY = 10
-"""Number of steps between updates of the eigenbasis of `Soap`."""
+"""Number of steps between updates of the eigenbasis of `Soap`, as in its paper."""
 
 NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)
 """Coefficients of the powers 1, 3 and 5 of a polynomial. Applied repeatedly to singular values, the
@@ -28,7 +28,7 @@ about as large (arXiv:2502.16982)."""
 
 MUON_WEIGHT_DECAY = 0.01
 INITIAL_POWER_ITERATIONS = 3
-"""Number of power iterations for the first eigenbasis of `Soap`, starting from the identity."""
+"""Number of power iterations from the identity to `Soap`'s first eigenbasis. Chosen by hand."""
 
 
 def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:

@@ -77,7 +77,7 @@ def train(
     from .dataset import prepare_data
     from .dense import DenseTrainer, initial_network
 
-    options, network = initial_network(options, init_weights)  # may raise, so it comes first
+    options, network = initial_network(options, init_weights)  # fails before labels are made
     data = prepare_data(
         images,
         options,

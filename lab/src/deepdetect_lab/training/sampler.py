@@ -87,7 +87,7 @@ class CropSampler(Sampler[list[CropIndex]]):
         schedule: the steps.
         shard_sizes: number of images in each shard, so that the crops of only a few shards are
             mixed at a time. None: the images are not in shards, and are all mixed.
-        first_step: the first of the steps, which go on to the last one.
+        first_step: number of the step to begin with. All later steps follow.
 
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
@@ -124,7 +124,7 @@ class CropSampler(Sampler[list[CropIndex]]):
         return batch
 
 
-@functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs
+@functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs at a time
 def epoch_order(
     seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
 ) -> np.ndarray:

@@ -59,7 +59,7 @@ used because a descriptor that was trained on less zoom was worse on zoomed imag
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
 """Index 0 is for the rotation of the first view, index 1 for the rotation between the views.
 `ROTATED_SHARES` are the shares of rotations by any angle. All other angles are small, with the
-standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees)."""
+standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees). Chosen by hand."""
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
 """The tilt of a view is the ratio of its scales along two axes. In the share `NORMAL_TILT` of the
@@ -69,19 +69,19 @@ seen at 66 degrees. Beyond it, little of the plane can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
 """The tilt of the scene in first views is at most 1 + `FIRST_TILT`, and the tilt of foreground
-parts at most 1 + `FRONT_TILT`. A tilt of 1 means no tilt."""
+parts at most 1 + `FRONT_TILT`. A tilt of 1 means no tilt. Chosen by hand."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
 """Standard deviation of both perspective coefficients of a homography, per pixel of a view with
 `SIDE_PX` pixels a side. Such a coefficient changes the scale by 11 % from the middle to a border.
-In first views, the coefficients are multiplied by `FIRST_PERSPECTIVE`."""
+In first views, the coefficients are multiplied by `FIRST_PERSPECTIVE`. Chosen by hand."""
 
 SHIFT_DEVIATION = 18.0
 """Standard deviation of the second view's shift, in pixels of the first view. Chosen by hand."""
 
 RELIEF_SHARE, RELIEF_PX = 0.45, (1.5, 5.0)
 """`RELIEF_SHARE` is the share of the second views that have a relief. The standard deviation of its
-displacements, in pixels, is drawn from the range `RELIEF_PX`."""
+displacements, in pixels, is drawn from the range `RELIEF_PX`. Chosen by hand."""
 
 SMOOTH_CELLS = (3, 8)
 """Reliefs and the outlines of foreground parts are interpolated from 3 to 7 random values along a
@@ -89,20 +89,20 @@ side. With more values, a relief could not be inverted, and foreground parts wou
 the area that describes a keypoint."""
 
 FRONT_SHARE, FRONT_COUNTS, OTHER_PHOTOGRAPH_SHARE = 0.5, (1, 1, 2, 3), 0.8
-"""`FRONT_SHARE` is the share of the scenes with foreground parts. Their number is drawn from
-`FRONT_COUNTS`. The share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs."""
+"""`FRONT_SHARE` of the scenes have foreground parts, whose number is drawn from `FRONT_COUNTS`. The
+share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs. Chosen by hand."""
 
 SHAPE_PX, UNCOVERED = 480, (0.6, 0.88)
 """A foreground part is cut from a photograph where smooth noise (`SHAPE_PX` pixels a side) exceeds
-a quantile from `UNCOVERED`. So parts are blobs that hold 12 to 40 % of their photograph."""
+a quantile from `UNCOVERED`: a blob of 12 to 40 % of the photograph. Chosen by hand."""
 
 FRONT_OFFSET_PX, FRONT_SCALE, FRONT_ANGLE = 60.0, 0.2, 0.3
-"""Pose of a foreground part relative to the scene's pose in the first view: largest offset along an
-axis in photograph pixels, and standard deviations of the log scale and of the angle in radians."""
+"""Pose of a foreground part relative to the scene's pose in the first view: largest offset per axis
+in photograph pixels, standard deviations of log scale and angle in radians. Chosen by hand."""
 
 MOTION_SHIFT, MOTION_SCALE, MOTION_ANGLE, MOTION_TILT = 22.0, 0.12, 0.06, 0.15
-"""Standard deviations of a foreground part's motion relative to the scene, between the views:
-shift in pixels of the first view, log scale, angle in radians, and log tilt."""
+"""Standard deviations of a foreground part's motion relative to the scene, between the views: shift
+in pixels of the first view, log scale, angle in radians, log tilt. Chosen by hand."""
 
 ALIASED_SCALE, PIXEL_SIGMA = 1.15, 0.5
 """A photograph that is reduced by a factor above `ALIASED_SCALE` is blurred before it is sampled,
@@ -118,7 +118,7 @@ in pixels. Much smaller steps would suffer from rounding."""
 
 ATTEMPTS = 200
 """A scene is drawn up to this number of times, until its views share enough keypoints. If they
-never do, the photographs have too little detail."""
+never do, the photographs have too little detail. Chosen by hand."""
 
 ITERATIONS = 5
 """Number of fixed-point iterations to invert a relief. After five, the error is below 0.01 pixels

@@ -20,7 +20,7 @@ WHITE = 255
 """The highest grey level of an 8-bit image."""
 
 MIDDLE_GREY = 0.5
-"""Contrast is changed around this value of [0, 1], so that the mean brightness hardly changes."""
+"""Contrast is scaled around this value of [0, 1], so that the mean brightness hardly changes."""
 
 NOISE_CELLS = (2, 5)
 """Smooth changes of light are interpolated from 2 to 4 random values along a side of the view. So
@@ -39,7 +39,7 @@ SHADOW_EDGE_PX = (0.7, 8.0)
 object close to the surface) to 8 pixels (light from a window)."""
 
 CURVE_TONES = 6
-"""A tone curve rises from black to white through 6 random grey levels."""
+"""A tone curve rises from black to white through 6 random grey levels. Chosen by hand."""
 
 DARK_NOISE_LEVELS, DARK_NOISE_LIGHT = (0.2, 0.6, 3.0), 0.25
 """The sigma of the noise in dark views is drawn between 0.2 grey levels and a maximum. The maximum

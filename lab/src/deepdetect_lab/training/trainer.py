@@ -171,7 +171,7 @@ class Trainer(abc.ABC):
         for mean, state in zip(*states, strict=True):
             if mean.is_floating_point():
                 mean.lerp_(state, 1 - decay)
-            else:  # the number of batches that a batch normalisation has seen
+            else:  # an integer: batches that a batch normalisation has seen
                 mean.copy_(state)
         return value
 
@@ -207,7 +207,7 @@ class Trainer(abc.ABC):
                     text += f", best {self._best(state)[self.objective]:.4f}"
                 bar.set_postfix_str(text, False)
                 if state.step in self.milestones:
-                    self._save(state, folder)  # the validation may be interrupted
+                    self._save(state, folder)  # a run may be interrupted while it validates
                     self._validate(state, folder)
                 if time.monotonic() - saved >= CHECKPOINT_INTERVAL_S:
                     self._save(state, folder)

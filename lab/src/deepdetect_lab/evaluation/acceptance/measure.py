@@ -35,10 +35,10 @@ FAMILIES: dict[str, Callable[[Path], Iterator[JudgedPair]]] = {
 """Functions that yield the pairs of a family (a data set or a kind of rendering), by name."""
 
 ORDERS, F_THRESHOLD_PX, F_CONFIDENCE, F_ITERATIONS, ACCURACY_PX = 11, 1.5, 0.9999, 10_000, 10
-"""MAGSAC gets the matches in `ORDERS` random orders, because its result depends on their order. Its
-threshold, confidence and iterations are those with which others report mAA (mean average accuracy):
-the fraction of hand-marked correspondences whose points are within d px of their epipolar lines in
-both images, averaged over d = 1, 2, ..., `ACCURACY_PX`."""
+"""MAGSAC estimates F from the matches in `ORDERS` random orders, because its result depends on the
+order. Its threshold in pixels, confidence and iterations are those of published figures of the mAA
+(mean average accuracy): the fraction of hand-marked correspondences whose points are within d px of
+their epipolar lines in both images, averaged over d = 1, 2, ..., `ACCURACY_PX`."""
 
 COLUMNS = {
     **{"kind": "", "answers": ",d", "right": ",d", "wrong, high": ",d", "wrong, fair": ",d"},

@@ -20,7 +20,7 @@ is below `RIGHT_PX`. An answer is right if at least the fraction `MIN_CORRECT` o
 correct, because otherwise the wrong matches would outvote the correct ones."""
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0.0]])
-"""Fundamental matrix of a rectified pair."""
+"""Fundamental matrix of a rectified pair, whose epipolar lines are the image rows."""
 
 Images = tuple[np.ndarray, np.ndarray]
 Answer = Literal["right", "wrong", "lost"]
@@ -36,7 +36,7 @@ class Truth:
         fundamental: (3, 3) fundamental matrix that holds outside the plane. None: matches outside
             the plane are wrong.
         posed: the cameras. If they are known, an answer with the correct pose is right.
-        by_pose: whether only the pose decides. The true epipolar lines may be off by pixels.
+        by_pose: whether only the pose decides, because true epipolar lines may be off by pixels.
         right_px: error limit of a correct match, in pixels.
         depth: whether the answer must say that the scene has depth.
     """
@@ -70,7 +70,7 @@ class Truth:
         return float(pose_errors(estimate_pose(points0, points1, *cameras), self.posed)[ERROR])
 
     def judge(self, matches: Matches) -> Answer:
-        """Return whether an answer is right; without matches it is "lost"."""
+        """Return "lost" without matches, otherwise whether the answer is "right" or "wrong"."""
         if not len(matches):
             return "lost"
         assert matches.geometry is not None

@@ -18,10 +18,10 @@ from ...datasets.posed_images import load_posed_scenes
 from .pairs import ROWS, UNRELATED, Images, JudgedPair, Truth
 
 MIDDLEBURY_SIDES_PX, FAR_FRAMES, SAME_PLACE_PX = (None, 480), range(15, 26, 5), 5.0
-"""Stereo pairs are matched at their own size and reduced to a longer side of 480 px, at which
-thresholds in pixels act differently. Frames `FAR_FRAMES` apart see the street from distant places.
-Images of one webcam or tripod fit the identity within a pixel, but matches within `SAME_PLACE_PX`
-count as correct, because clouds and wind move parts of the scene."""
+"""Middlebury's pairs are matched at their own size and at a longer side of 480 px, at which
+thresholds in pixels act differently. Pairs of video frames `FAR_FRAMES` apart are a kind of their
+own. Images of one webcam or tripod fit the identity within a pixel, but errors below
+`SAME_PLACE_PX` count as correct: clouds and wind move things."""
 
 
 def read(first: Path, second: Path, side_px: int | None = None) -> Images:

@@ -23,10 +23,10 @@ MODULES = (
     "deepdetect.matching.guided.simulated_views",
     "deepdetect.geometry.two_view",
 )
-"""The modules whose constants are changed."""
+"""The modules of guided matching whose numeric constants are changed."""
 
 FACTORS = 0.7, 1.4
-"""Each constant is multiplied by each factor. No reason behind a constant excludes such changes."""
+"""Each constant is multiplied by either factor; all others keep their values. Chosen by hand."""
 
 COLUMNS = {
     **{"constant": "", "module": "", "value": "", "factor": ".1f", "answers": ",d"},

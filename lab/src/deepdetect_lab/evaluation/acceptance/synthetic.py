@@ -1,6 +1,6 @@
 """Pairs rendered from photographs: planes, facades, hard views, overlays, frames and strips.
 
-The random generator of a pair is seeded by numbers of its family and of the pair.
+The seed of a pair's random generator is the number of its family and its own number.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from ..metrics.pose import rotation_error
 from .pairs import ROWS, UNRELATED, Images, JudgedPair, Truth
 
 PLANES, FACADES, HARD, OVERLAYS, FRAMES, STRIPS = 60, 90, 200, 60, 30, 40
-"""Numbers of pairs of each family."""
+"""Numbers of pairs to render in each family. Chosen by hand."""
 
 SIZE, NOISE = (720, 600), 3.0
-"""Width and height of synthetic images in pixels, and the standard deviation of their noise in grey
-levels, about that of a phone indoors."""
+"""Width and height of synthetic images in pixels, and standard deviation of their noise in grey
+levels. A phone's photographs taken indoors have about this noise."""
 
 SHARES, ASPECTS, MIN_ROTATION_DEG = (0.1, 0.2, 0.4), (6, 8, 12, 16), 5.0
-"""Planes and overlays cover `SHARES` of the image. Strips are `ASPECTS` times as wide as high.
-Frames are laid on pairs whose cameras rotated by more than `MIN_ROTATION_DEG`, so that "no
-rotation", which fits the frame because it stands still, is clearly a wrong answer."""
+"""Planes and overlays cover one of the fractions `SHARES` of the image. Strips are `ASPECTS` times
+as wide as high. Frames are laid on pairs whose cameras rotated by more than `MIN_ROTATION_DEG`. "No
+rotation", which fits the still frame, is then clearly wrong. Chosen by hand."""
 
 
 class Photographs:
@@ -49,11 +49,11 @@ class Photographs:
         return [pair for scene in load_posed_scenes(self.data) for pair in scene.pairs]
 
     def any(self, rng: np.random.Generator, size: tuple[int, int] = SIZE) -> np.ndarray:
-        """Return a random photograph of `others`, scaled to `size` (width, height)."""
+        """Return a random photograph from the list `others`, scaled to `size` (width, height)."""
         return resized(load_image(self.others[rng.integers(len(self.others))]), size)
 
     def unlike(self, rng: np.random.Generator) -> list[np.ndarray]:
-        """Return two different photographs of `others`, scaled to `SIZE`."""
+        """Return two different photographs from the list `others`, scaled to `SIZE`."""
         two = rng.choice(len(self.others), 2, replace=False)
         return [resized(load_image(self.others[number]), SIZE) for number in two]
 

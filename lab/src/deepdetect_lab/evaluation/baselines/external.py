@@ -118,7 +118,7 @@ def onnx_feature(
 
 
 class _Network(NamedTuple):
-    """A loaded ONNX file. `shapes` has the shape of each input, in which free sides are no int."""
+    """A loaded ONNX file. `shapes` has each input's shape, in which free sides are not integers."""
 
     shapes: list[list[Any]]
     outputs: list[str]

@@ -22,10 +22,10 @@ SIGMAS_PX = tuple(float(sigma) for sigma in np.geomspace(1.5, 9.1, 7))
 
 NMS_RADIUS = 2
 DISTANCE_PX = 2.0
-"""Keypoints of equal or different scales are at least this far apart. Chosen by hand."""
+"""Keypoints of equal or different scales are at least this many pixels apart. Chosen by hand."""
 
 SIZE_PER_SIGMA = 5.0
-"""The size (diameter) of a keypoint is 5 times the sigma at which it was found."""
+"""Diameter of a keypoint, divided by the sigma of its scale. Chosen by hand."""
 
 
 def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:

@@ -36,7 +36,7 @@ OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
         {"nOctaveLayers": 4, "contrastThreshold": 1e-9, "edgeThreshold": 100, "sigma": 0.7},
     ),
     "orb": ("ORB", "ORB_create", {}),
-    "orb-many": ("ORB", "ORB_create", {"nfeatures": 10_000}),  # the default is 500
+    "orb-many": ("ORB", "ORB_create", {"nfeatures": 10_000}),  # OpenCV's default is 500
     "orb-low": ("ORB, low settings", "ORB_create", {"nfeatures": 1_000_000, "fastThreshold": 1}),
     "brisk": ("BRISK", "BRISK_create", {}),
     "brisk-low": ("BRISK, low settings", "BRISK_create", {"thresh": 1, "octaves": 4}),

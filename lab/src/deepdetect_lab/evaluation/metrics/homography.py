@@ -12,7 +12,7 @@ from deepdetect.geometry.transforms import transfer_errors, transform_points
 CORNER_THRESHOLDS_PX = (1.0, 3.0, 5.0)
 
 MATCH_THRESHOLDS_PX = (1, 3)
-"""Error thresholds at which matches are counted as correct."""
+"""Matches with a transfer error up to these thresholds, in pixels, are counted as correct."""
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(width, height) of each of the two images."""

@@ -23,7 +23,7 @@ CHANCE_POINTS = 20_000
 level of few points would be noisy. Chosen by hand."""
 
 MAX_DRAWS = 100
-"""Random points are drawn at most this often; few keypoints would need thousands of draws."""
+"""Random points are drawn at most this often, even if keypoints are few. Chosen by hand."""
 
 MIN_POINTS_FOR_THREADS = 20_000
 

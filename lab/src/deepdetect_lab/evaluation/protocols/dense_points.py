@@ -63,7 +63,7 @@ DENSE_NOTE = (
 
 
 CELL_PX = 4
-"""Side in pixels of the cells in which clouds are compared: some use only every second pixel."""
+"""Clouds are compared in image squares of this side: some skip every second pixel."""
 
 CLOUD_COLUMNS = {
     "cloud": "",
@@ -170,7 +170,7 @@ def measure_dense_points(
 
 
 def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> Row:
-    """Compare the two depth maps in each pair; `name` begins the column titles of the result."""
+    """Compare the depth maps of each pair; `name` begins the column titles of the result."""
     differences = []
     for first, second in pairs:
         both = np.isfinite(first) & np.isfinite(second)

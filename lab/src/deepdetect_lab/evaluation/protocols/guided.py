@@ -27,7 +27,7 @@ from ..run import Run
 from .paper import CORRECT_PX, PAPER_MATCHING
 
 SEEDS = 3
-"""Guided matching runs with this number of seeds, because its random choices change the counts."""
+"""Number of seeds of guided matching: its random choices change the counts. Chosen by hand."""
 
 COLUMNS = {
     "pair": "",
@@ -149,7 +149,7 @@ def _guided_cells(
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Name the models that guided the seeds, and how many seeds were guided if not all were."""
+    """Name the models that guided matching, and the number of guided seeds if only some were."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):

@@ -155,7 +155,7 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
         mask = load_mask(image.mask)
         if mask.shape[::-1] != keypoints.image_size:
             raise ImageError(f"the mask {image.mask.name} and its photograph differ in size")
-        fraction = foreground_fraction(keypoints.xy, mask)  # NaN without keypoints
+        fraction = foreground_fraction(keypoints.xy, mask)  # NaN if there are no keypoints
         return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
 
     items = {each.image.name: each for each in images}

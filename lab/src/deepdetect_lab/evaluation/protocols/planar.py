@@ -38,7 +38,7 @@ KEYPOINT_SCENES = ("graf", "bikes", "leuven")
 GUIDED_PAIRS = (*paper.OXFORD_PAIRS, ("boat", 6), ("bark", 6))
 
 FIGURE_7_SCENES = 4
-"""HPatches scenes drawn for Figure 7: half with changing light, half with changing viewpoint."""
+"""Number of HPatches scenes in Figure 7: half with changing light, half with changing viewpoint."""
 
 TRUTHS = {
     "published": (

@@ -53,7 +53,7 @@ and nearer than this number of baselines. The value is so large that all points 
 BUDGET = 8192
 RATIO = 0.8
 GOOD_DEG = 5.0
-"""A pose with an error below this counts as correct when a pair is compared with SIFT's pose."""
+"""A pose counts as correct if its error in degrees is below this. Chosen by hand."""
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 

@@ -43,7 +43,7 @@ from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
 MIN_IMAGES = 3
 
 POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
-"""Thresholds of the pose AUC, lower than for image pairs since bundle adjustment is accurate."""
+"""Thresholds of the pose AUC: lower than for image pairs, as bundle adjustment is accurate."""
 
 DATABASE = "sift.db"
 
@@ -123,7 +123,7 @@ class SfmMethod:
     `find` writes the keypoints of a folder of images to a file, and `match` returns the matches of
     image pairs. Both functions must be module-level, because another process runs them. `name` and
     `version` identify cached results. If `chance` is set, the time of `find` is not reported. If
-    `refined` is set, COLMAP's tracks are refined. `tracks` is the value of the option `matches`.
+    `refined` is set, COLMAP's tracks are refined. `tracks` is `MultiViewOptions.matches`.
     """
 
     name: str
@@ -219,7 +219,7 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
 
 
 def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
-    """Measure dense points or read the values from the cache: rows for DeepDetect and SGBM."""
+    """Measure dense points of a scene by DeepDetect and SGBM, or read the rows from the cache."""
     images = tuple(image.path for image in scene.images)
     cameras = {image.name: image.camera for image in scene.images}
     known = {} if scene.located_only else cameras

@@ -53,7 +53,7 @@ MIN_FILLED = 0.9
 budget, because otherwise the numbers of keypoints would differ between methods. Chosen by hand."""
 
 MAX_CHANCE = 0.95
-"""Values are not corrected above this chance level, since the correction divides by 1 - chance."""
+"""Repeatability is not corrected for chance above this chance level: the divisor is 1 - chance."""
 
 MATCHING_NOTE = (
     f"The best {MATCHING_BUDGET:,} keypoints of each image are matched by mutual nearest "

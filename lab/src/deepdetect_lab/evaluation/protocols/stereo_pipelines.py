@@ -27,7 +27,7 @@ from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from .paper_numbers import FIGURE_8
 
 ROUNDS = 3
-"""Pipelines that take only seconds run this number of times, and their median time is reported."""
+"""Pipelines that take seconds run this often; their median time is reported. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray, int]
 """The result of a pipeline: pixels of points in the left image, (N, 2); their disparities, (N,);

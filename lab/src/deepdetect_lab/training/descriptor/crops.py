@@ -19,20 +19,20 @@ from ..teachers.readings import Reading, load_reading, reading_file
 from .views import JITTER_PX, SIZE_ERRORS, photograph_view
 
 CROP_PX, CROP_POINTS = 384, 384
-"""Side of a crop in pixels, and number of points per crop. Crops are three quarters as wide as the
-photographs, so that they show about as much around a point as the teachers saw. The number of
-points is limited because the loss compares all pairs of points."""
+"""Side of a crop in pixels, and number of points per crop. Crops are four fifths as wide as
+photographs of 480 pixels, so that they show about as much around a point as the teachers saw. The
+number of points is limited because the loss compares all pairs of points."""
 
 TURNED_SHARE, CLEAN_SHARE = 0.15, 0.4
-"""Share of the crops that are rotated by any angle, and share that get no camera effects. With more
-rotated or degraded crops, descriptors of upright photographs were learned less well."""
+"""Share of the crops that are rotated by any angle, and share without camera effects. They were
+chosen by hand, because upright photographs gained less when more crops were rotated or degraded."""
 
 FAR_SCALE = Effect(0.4, math.log(0.4), math.log(2.4))
 """The log scale of 40 % of the crops is drawn from this range, which is wider than `SCALE`, so that
 the network learns the same descriptors at any scale."""
 
 ATTEMPTS = 50
-"""Number of photographs to try per crop, since some may have no reading (teacher outputs) yet."""
+"""Number of photographs to try per crop: some have no reading (teacher outputs). Chosen by hand."""
 
 
 class Crops(NamedTuple):
@@ -43,7 +43,7 @@ class Crops(NamedTuple):
         positions: (B, N, 2) float32, in pixels.
         sizes: (B, N) float32 diameters, in pixels.
         codes: (B, N, 192) float16 descriptors of the teachers; in losses, float32 and whitened.
-        survival: (B, N) float32, share of the photograph's points with a lower score of ALIKED.
+        survival: (B, N) float32, share of the photograph's points with a lower ALIKED score.
         turn: (B,) float32, the angle by which the photograph is rotated, in radians.
     """
 

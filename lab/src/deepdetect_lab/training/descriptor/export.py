@@ -21,7 +21,7 @@ from .network import KeypointNetwork
 
 MIN_HALVED = 1000
 """Kernels with more values than this are stored as float16, which halves the file. The graph
-converts them to float32 before it computes with them."""
+converts them to float32 before it computes with them. Chosen by hand."""
 
 
 def export_descriptor(network: KeypointNetwork, path: Path) -> None:

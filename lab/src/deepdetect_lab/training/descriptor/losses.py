@@ -27,7 +27,7 @@ KINDS = ("upright", "turned", "zoomed")
 
 def kind_of(angle: float, zoom: float) -> str:
     """Return one of `KINDS` for the absolute rotation (radians) and log zoom between two views."""
-    if zoom > 0.6:  # a zoom by a factor of 1.8
+    if zoom > 0.6:  # the log of a zoom by a factor of 1.8
         return "zoomed"
     return "upright" if angle < UPRIGHT else "turned"
 

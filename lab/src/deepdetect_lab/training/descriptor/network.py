@@ -20,13 +20,13 @@ from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, 
 from deepdetect.features.learned import CONSTANT, FREQUENCIES, LENGTH
 
 HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
-"""`HIDDEN` is the number of hidden units of the perceptron. The other constants are numbers of
-channels of feature maps, from 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`)."""
+"""`HIDDEN` is the number of hidden units of the perceptron. The others are numbers of channels of
+feature maps at 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`). Chosen by hand."""
 
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
-"""A keypoint up to this size is described by feature maps of the full image only. For a larger
-keypoint, the maps of the two octaves nearest to its size are interpolated and used as well."""
+"""A keypoint up to this diameter is described by maps of the full image only. For a larger one,
+maps of the two octaves nearest to its size are interpolated and used as well. Chosen by hand."""
 
 SMALLEST_SIZE_PX = 2.5
 NOISE = 1 / 255
@@ -107,7 +107,7 @@ class KeypointNetwork(nn.Module):
         nn.init.zeros_(self.get_parameter("by_size.2.bias"))
         self.norm, self.middle_norm = nn.BatchNorm1d(hidden), nn.BatchNorm1d(hidden)
         self.middle, self.output = nn.Linear(hidden, hidden), nn.Linear(hidden, LENGTH)
-        self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # log(1 / t) in the loss
+        self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # log of 1 / temperature
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
         """Return the feature maps of each octave."""

@@ -37,7 +37,7 @@ DECAY_SHARE = 0.65
 """The learning rate falls linearly to 0 over this last share of the steps. Chosen by hand."""
 
 VECTOR_RATE = 0.4
-"""AdamW trains the parameters that do not suit Muon, at Muon's learning rate times this factor."""
+"""AdamW trains parameters unsuited to Muon, at this fraction of Muon's rate. Chosen by hand."""
 
 
 def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
@@ -72,7 +72,7 @@ def stack(pairs: Sequence[Pair]) -> Pair:
 class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
     """Each step, with the pairs that it is the first to use (or None) and their numbers.
 
-    The seed and its number determine a pair.
+    A pair is determined by the seed and the pair's number.
     """
 
     def __init__(self, files: Sequence[Path], options: DescriptorTrainingOptions) -> None:
@@ -163,7 +163,7 @@ class DescriptorTrainer(Trainer):
         return load_network(init_weights, self.kind_of_network)
 
     def rate_factor(self, name: str) -> float:
-        """Return the factor of the learning rate of a parameter."""
+        """Return the factor by which the learning rate is multiplied for a parameter."""
         return 1.0
 
     def dataset(self) -> Dataset[Any]:

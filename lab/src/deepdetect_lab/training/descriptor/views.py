@@ -32,8 +32,8 @@ KEYPOINTS = 256
 all keypoints of the other view. This number is enough to fill a view."""
 
 LEAST_KEYPOINTS, LEAST_IF_ZOOMED, ZOOMED = 64, 40, 0.8
-"""Pairs whose views share fewer than `LEAST_KEYPOINTS` keypoints are drawn again. If the absolute
-logarithm of the zoom between the views is above `ZOOMED`, the limit is `LEAST_IF_ZOOMED`."""
+"""Pairs whose views share fewer than `LEAST_KEYPOINTS` keypoints are drawn again, or fewer than
+`LEAST_IF_ZOOMED` if the absolute log zoom between them is above `ZOOMED`. Chosen by hand."""
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
 """Candidates of the first view are used if their sigma is below `MAX_FIRST_SIGMA_PX`, but at most
@@ -44,20 +44,20 @@ SIGMA_RANGE_PX = (1.0, 13.0)
 cannot be described, and the areas that describe larger ones do not fit into the view."""
 
 MIN_GROWTH = 0.02
-"""Keypoints are left out if the area around them shrinks to less than this fraction from the first
-to the second view, because the second view sees their surface at a grazing angle."""
+"""Keypoints are left out if the area around them shrinks below this fraction in the second view,
+which then sees their surface at a grazing angle. Chosen by hand."""
 
 CLEAN_SHARE, RANDOM_SHARE = 0.6, 0.7
 """`CLEAN_SHARE` is the share of the pairs whose keypoints are detected before light and noise are
 changed, to simulate a repeatable detector. `RANDOM_SHARE` is the share of the pairs that keep
-random keypoints instead of the strongest."""
+random keypoints instead of the strongest. Chosen by hand."""
 
 JITTER_PX = 0.5
 """Keypoints in the first view are moved at random by up to half a pixel, as rounding would do."""
 
 SIZE_ERRORS, SMALL_ERROR_SHARE = (0.12, 0.4), 0.6
-"""Keypoint sizes in the second view get random errors. The standard deviation of the log size is
-`SIZE_ERRORS[0]` for the share `SMALL_ERROR_SHARE` of the keypoints, and `SIZE_ERRORS[1]` else."""
+"""Log sizes of keypoints in the second view get random errors. Their standard deviation is
+`SIZE_ERRORS[0]` in the share `SMALL_ERROR_SHARE`, `SIZE_ERRORS[1]` in the rest. Chosen by hand."""
 
 PLACE_ERROR_PX, PLACE_ERROR_PER_SIGMA, PLACE_ERROR_SIGMA = 0.225, 0.162, 6.0
 """Keypoint positions in the second view get random errors. Their standard deviation in pixels is

@@ -120,7 +120,7 @@ class RankerTrainer(Trainer):
         self.options, self.num_workers, self.files = options, num_workers, images
         self.pairs = validation_pairs(validation, options.val_pairs)
         dataset = PairDataset(self.files, options)
-        pairs = (dataset[2**31, number] for number in range(STATISTICS_PAIRS))  # not in training
+        pairs = (dataset[2**31, number] for number in range(STATISTICS_PAIRS))  # not trained on
         features = np.concatenate([view.features for pair in pairs for view in pair.views])
         features = features.astype(np.float64)
         make = partial(RankerModule, features.mean(0), features.std(0))

@@ -107,13 +107,13 @@ CHANGES = {
 scenes: a viewpoint change of 60 degrees and a zoom of 4."""
 
 LEAST_LOG_ZOOM = math.log(1.3)
-"""Zooms up to this logarithm may enlarge the photograph by more than `MAX_ENLARGEMENT`."""
+"""The limit of the log zoom due to `MAX_ENLARGEMENT` is at least this. Chosen by hand."""
 
 ROTATED_SHARE = 0.2
 """Share of the pairs in which one random rotation is added to both views. Chosen by hand."""
 
 FOCAL_SIDES = (1.2, 3.0)
-"""Range of the focal length, in sides of the view: fields of view from 45 to 19 degrees."""
+"""Focal lengths, in sides of the view: fields of view from 45 to 19 degrees. Chosen by hand."""
 
 SHRUNK_SCALE, LEAST_SIDE_PX = 0.9, 8
 """If a view shows the photograph at a scale below `SHRUNK_SCALE`, the photograph is first shrunk to

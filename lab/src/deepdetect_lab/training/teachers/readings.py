@@ -55,8 +55,8 @@ CODE_LENGTHS = (64, 128)
 
 EDGEPOINT_WEIGHT, WHITENING = 0.6, 0.75
 """EdgePoint2's part of a whitened code has 0.6 times the length of ALIKED's part. Values along an
-axis are divided by their standard deviation to the power 0.75. In a pair of webcam images, both
-descriptors together give 913 correct matches if whitened, and 885 as published."""
+axis are divided by their standard deviation to the power 0.75. At 2,048 points, webcam pairs have
+913 correct matches with both descriptors together if whitened, and 885 as published."""
 
 SOME_READINGS, SOME_POINTS = 256, 80
 """Means and axes of the whitening are computed from about 80 points of each of 256 readings: 20,480
