@@ -45,9 +45,9 @@ def counts_of(values: np.ndarray) -> np.ndarray:
 def find_range(counts: np.ndarray) -> ValueRange:
     """Find the values of black and white from the counts of all 65536 values.
 
-    White is the largest value of a bit depth in `SENSOR_BITS`. At most the share `MAX_OUTLIERS` of
-    the pixels is brighter, apart from padding with 65535. Black is 0, unless all values lie in a
-    narrow band farther from 0 than it is wide: then the range is that band, at least 255 wide.
+    White is the largest value of the first bit depth in `SENSOR_BITS` that at most the share
+    `MAX_OUTLIERS` of the pixels exceed; 65535 may be padding. Black is 0, unless the values lie in
+    a narrow band farther from 0 than it is wide: then the range is that band, at least 255 wide.
     """
     levels = np.flatnonzero(counts)
     inner = levels[(levels > 0) & (levels < 65535)]  # 0 and 65535 may be padding

@@ -218,7 +218,7 @@ def output_folder(output: Path) -> Path:
 def expand_images(paths: Sequence[Path], output: Path) -> dict[str, Path]:
     """Return the given images and those below the given folders, named as by `name_images`.
 
-    Images in the output folder are left out; so are results of other given images, with a message.
+    Left out: images in the output folder and, with a message, files made from other given images.
     """
     given = {str(path.resolve()) for path in paths}
     kept = []

@@ -241,7 +241,7 @@ def _reading(path: str | Path) -> Iterator[None]:
         missing = isinstance(error, FileNotFoundError)
         kind = MissingCalibrationError if missing else ReconstructionError
         raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # the readers of these formats raise exceptions of many types
+    except Exception as error:  # the readers of camera files raise exceptions of many types
         raise ReconstructionError(
             f"{path} is damaged ({first_line(error)}): correct it, or give the focal length"
         ) from None

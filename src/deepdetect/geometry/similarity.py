@@ -108,7 +108,7 @@ def fit_similarity(
     found = _search(points, targets, known, up, scale)
     if found is None:
         raise ReconstructionError("the points are in one place")
-    middle = points.mean(axis=0)  # rotation and scaling about it do not change the translation
+    middle = points.mean(axis=0)  # turning and scaling about this point leave it in place
     own, free = points - middle, 7 if scale is None else 6
     current = Similarity(found.scale, found.rotation, found.apply(middle[None])[0])
     distances = np.linalg.norm((targets - current.apply(own)) * known, axis=1)

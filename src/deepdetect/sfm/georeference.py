@@ -464,7 +464,7 @@ def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
 
 
 def _image_and_pixel(end: str, names: Mapping[str, str]) -> tuple[str, np.ndarray | None]:
-    """Return the image that an end of a distance names, and its pixel (None if none is given)."""
+    """Parse an end, as in `scale_by_distance`, to an image's full name and a pixel or None."""
     pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", end)
     name = pixel[1] if pixel else end
     if name not in names:

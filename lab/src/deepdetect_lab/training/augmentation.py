@@ -109,7 +109,7 @@ def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -
 
 
 def add_sensor_noise(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Add a random sensor's read and shot noise to (H, W, 3) uint8; in half of the cases, grey."""
+    """Add a random sensor's read and shot noise, half of the time grey, to (H, W, 3) uint8."""
     read, gain = math.exp(generator.uniform(*READ_NOISE)), generator.uniform(*SHOT_NOISE)
     channels = int(generator.choice([1, 3]))
     noise = generator.standard_normal((*rgb.shape[:2], channels), np.float32)

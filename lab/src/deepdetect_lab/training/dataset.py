@@ -234,7 +234,7 @@ def prepare_data(
     """List the images of a run, and make the missing labels of their views.
 
     The arguments are those of `train`, and `processes`: the number of processes that load crops.
-    Each of these processes may keep views in an equal part of the memory.
+    Each may keep training views in its part of half of the free memory.
     """
     images, output = Path(images), Path(output)
     folder = output / "labels" if labels is None else Path(labels)

@@ -186,7 +186,7 @@ class DescriptorNetwork(KeypointNetwork):
 
 
 def shares_of_octaves(sizes: Tensor, octaves: int) -> tuple[Tensor, ...]:
-    """Return the weight of each octave, (B, N, 1), in the samples at keypoints of sizes (B, N)."""
+    """Return, per octave, its interpolation weights (B, N, 1) for keypoint sizes (B, N)."""
     sizes = sizes.clamp(min=SMALLEST_SIZE_PX)
     own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, octaves - 1)[..., None]
     shares = (1 - (own - torch.arange(octaves, device=sizes.device)).abs()).clamp(min=0)
