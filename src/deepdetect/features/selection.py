@@ -354,7 +354,8 @@ def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarr
     """Choose a random position in each grid cell; return their rows of `xy`, ascending."""
     cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
     order = np.random.default_rng(seed).permutation(len(cell))
-    _, first = np.unique(cell[order], axis=0, return_index=True)
+    column, row = (cell - cell.min(axis=0, initial=0)).T
+    _, first = np.unique((row * (column.max(initial=0) + 1) + column)[order], return_index=True)
     return np.sort(order[first])
 
 

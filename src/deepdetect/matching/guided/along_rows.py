@@ -316,12 +316,18 @@ def _sample(view: RectifiedView, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarra
     rows, column, row = rows[known], column[known], row[known]
     positions, nearest = positions[rows], disparity[row, column]
     # The disparity is interpolated bilinearly over the neighbours on the same surface.
-    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-    first = np.floor(positions).astype(np.int64)
-    x, y = np.moveaxis(np.clip(first + corners[:, None], 0, (width - 1, height - 1)), 2, 0)
-    gaps = np.nan_to_num(disparity[y, x] - nearest, nan=np.inf)
-    weights = np.prod(1 - np.abs(corners[:, None] - (positions - first)), axis=2) * (abs(gaps) <= 1)
-    gap = np.average(np.where(weights > 0, gaps, 0), axis=0, weights=weights + 1e-12)
-    shift = np.column_stack([nearest + gap, np.zeros(len(rows))])
+    left, top = np.floor(positions).astype(np.int64).T
+    total, weights = np.zeros(len(rows)), np.full(len(rows), 1e-9)
+    for down in (0, 1):
+        for across in (0, 1):
+            x, y = np.clip(left + across, 0, width - 1), np.clip(top + down, 0, height - 1)
+            value = disparity[y, x]
+            weight = np.abs(1 - across - (positions[:, 0] - left)) * np.abs(
+                1 - down - (positions[:, 1] - top)
+            )
+            weight *= np.abs(value - nearest) <= 1  # False for NaN
+            total += weight * np.nan_to_num(value - nearest)
+            weights += weight
+    shift = np.column_stack([nearest + total / weights, np.zeros(len(rows))])
     scores = np.clip(view.correlation[row, column], 0, 1)
     return rows, view.from_frame(positions - shift, 1), scores
