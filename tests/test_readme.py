@@ -62,12 +62,12 @@ def test_the_command_lines_run(folder: Path, line: str) -> None:
 def test_the_calls_of_the_table_run(folder: Path, line: str) -> None:
     import deepdetect
 
-    left = deepdetect.load_image("left.png")
+    left, right = deepdetect.load_image("left.png"), deepdetect.load_image("right.png")
     names = {
         **{name: getattr(deepdetect, name) for name in deepdetect.__all__},
         **{"detector": deepdetect.DeepDetect(), "points": deepdetect.PointDetector(500)},
         **{"image": left, "mask": left[..., 0] > 100},
-        **{"a": left, "b": deepdetect.load_image("right.png")},
+        **{"a": left, "b": right, "matches": deepdetect.match_images(left, right)},
     }
     assert eval(line, names) is not None
 
