@@ -140,7 +140,8 @@ class PolarFrame:
             start + slope.reshape(row.shape) * radius
             for start, slope in zip(starts.tolist(), slopes.T, strict=True)
         )
-        return np.stack([x / z, y / z], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):  # points at infinity
+            return np.stack([x / z, y / z], axis=-1)
 
     def _directions(self, angles: np.ndarray, view: int) -> np.ndarray:
         first = np.column_stack([np.cos(angles), np.sin(angles)])

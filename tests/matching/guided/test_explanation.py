@@ -224,13 +224,13 @@ def test_a_frame_that_stands_still_is_no_motion(photo: np.ndarray) -> None:
     assert (errors < 1).mean() > 0.95
 
 
-@pytest.mark.parametrize("number", [14, 32])
+@pytest.mark.parametrize(("number", "seed"), [(14, 0), (32, 0), (16, 2), (16, 3)])
 def test_a_still_overlay_of_a_scene_that_is_not_found_is_not_trusted_highly(
-    shared: Path, number: int
+    shared: Path, number: int, seed: int
 ) -> None:
-    """40 % of the image is a texture that stands still; the scene behind it moves far."""
+    """20 or 40 % of the image is a texture that stands still; the scene behind it moves far."""
     pair = next(islice(synthetic.overlays(shared / "data"), number, None))
-    found = match_images(*pair.make())
+    found = match_images(*pair.make(), seed=seed)
     assert found.geometry is not None
     assert found.geometry.confidence != "high" or pair.truth.judge(found) == "right"
 

@@ -374,11 +374,18 @@ class Explanation:
         own, seen = layer.hypothesis, layer.evidence
         least = HIGH_SHARE if len(self.layers) == 1 else MOST
         unlike = contradicts(seen)
-        if own.model == "homography" and stands_still(own.matrix, self._pair.sizes):
-            unlike |= seen.agreement < NEARLY_ALL  # the still part may be an overlay
+        if self._stands_still(layer.matches):
+            still = self._seen(own.tentative.cross_modal)[1].along_plane(np.eye(3))
+            unlike |= still.evidence.agreement < NEARLY_ALL  # the still part may be an overlay
         strong = seen.share >= least and own.log10_nfa < HIGH_LOG10_NFA
         before = layer.tracks is not None and layer.tracks.show_depth(True, self._seed)
         return seen.confirms and strong and not (layer.repeated or unlike or before)
+
+    def _stands_still(self, matches: GuidedMatches) -> bool:
+        """Return whether half of the matches of equal-sized images move less than `MAX_STILL`."""
+        first, second = self._pair.sizes
+        motion = np.linalg.norm(matches.points1 - matches.starts(self.pixels[0]), axis=1)
+        return first == second and bool(np.median(motion) < MAX_STILL * max(first))
 
     def _with_scene(
         self, geometry: TwoViewGeometry, points0: np.ndarray, points1: np.ndarray
