@@ -1,8 +1,8 @@
 """Find overlays, which stand still while the scene moves: frames, captions, logos, a car's bonnet.
 
-Regions that look the same at the same pixels of two images are overlays if all matches around them
-clearly move, as one scene that fills more of the image. Regions that shift as a whole by a fraction
-of a pixel are not overlays but distant parts of the scene.
+A region that looks the same at the same pixels of two images is an overlay if all matches around it
+move clearly and agree with one geometry, and moving matches fill more of the image than still ones.
+A region that shifts as a whole by a fraction of a pixel is a distant part of the scene.
 """
 
 from __future__ import annotations
@@ -31,35 +31,35 @@ WINDOW_PX, MAX_DIFFERENCE, MIN_LIKENESS, MIN_GRADIENTS = 7, 0.3, 0.95, 32.0
 """A place looks the same in two images if, in a window of side WINDOW_PX, the difference of their
 gradients is below MAX_DIFFERENCE times the sum of both, or their correlation is above MIN_LIKENESS
 (letters before a brighter ground), and the sum is above MIN_GRADIENTS: 2 grey levels per pixel in
-each image, as Sobel's filter scales them. In 313 pairs without an overlay, none was found."""
+each image, times the gain 8 of Sobel's filter. 313 pairs without an overlay gave no false one."""
 
 MAX_STILL_PX, MIN_MOTION_PX, NEIGHBOURS = 1.5, 3.0, 8
 """A match stands still if it moves by less than MAX_STILL_PX, about the error of a keypoint. The
 scene clearly moves at a place if its NEIGHBOURS nearest moving matches move by more than
-MIN_MOTION_PX. Where a camera drives along a street, few matches at its end move that far."""
+MIN_MOTION_PX, which few do at the far end of a street along which the camera drives."""
 
 MIN_AREA_PX, MIN_CLEAR_SHARE = 128, 0.67
 """A still region is an overlay if the scene clearly moves at the fraction MIN_CLEAR_SHARE of it,
 and if MIN_AREA_PX of its pixels (half a word of a caption) look different where the scene moves to.
-A whole window of pixels is enough if they shift by less than MAX_SHIFT_PX: in 177 real pairs, no
-pixel does so, in a time stamp 62 do, in a car's bonnet 7,000."""
+WINDOW_PX^2 of these pixels are enough if they shift by less than MAX_SHIFT_PX: in 177 real pairs
+without an overlay, no pixel does so, in a time stamp 62 do, on a car's bonnet 7,000."""
 
 MAX_SHIFT_PX, MIN_UNITY, MIN_ROUNDNESS = 0.15, 0.6, 0.5
-"""Distant parts of a scene, unlike overlays, shift as a whole: by more than MAX_SHIFT_PX, and by
-more than MIN_UNITY times the median shift of their windows (shifts within a text differ). A
-window's shift is known if its structure tensor's determinant exceeds MIN_ROUNDNESS times the
-squared half trace, because an edge that moves along itself looks still."""
+"""A region is distant scene, not an overlay, if its median shift vector is longer than MAX_SHIFT_PX
+and than MIN_UNITY times the median length of the shifts around its pixels: shifts within a text
+point in all directions. A shift is known if its window's structure tensor has a determinant above
+MIN_ROUNDNESS times the squared half trace, because an edge that moves along itself looks still."""
 
 CELL_PX = 32
-"""The motion of the scene is interpolated between the centres of squares of this side. Still and
-moving matches are compared by the number of squares that contain some."""
+"""The motion of the scene is interpolated between the centres of squares of this side. The areas of
+still and of moving matches are compared by the number of squares that contain some."""
 
 SOBEL_GAIN = 8
 """Sobel's 3 x 3 filter returns this multiple of the gradient."""
 
 
 _Matched = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Positions of matches in two reduced images, (K, 2) each, and which belong to the scene."""
+"""Positions of matches in two reduced images, (K, 2) each, and which show the scene, (K,) bool."""
 
 
 def scene_of(
@@ -104,7 +104,7 @@ def tell_still(share: float) -> None:
 def still_matches(
     pair: ImagePair, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return which matches lie on a still overlay, (K,) bool, and its share of the image."""
+    """Return which matches lie on still overlays, (K,) bool, and the image share of the overlays."""
     small, scales = pair.both(COMPARED_SIDE_PX)
     still = _same(*small) if pair.sizes[0] == pair.sizes[1] else np.zeros(1, bool)
     if np.count_nonzero(still) < MIN_AREA_PX:
@@ -149,7 +149,7 @@ def _overlay_of(pairs: Sequence[ImagePair], seed: int, moves: bool = False) -> n
 
 
 def _sparse_matches(pair: ImagePair, seed: int, exactly_still: np.ndarray) -> _Matched:
-    """Match learned points of a reduced pair; those of the scene agree with one geometry."""
+    """Match learned points of a reduced pair; matches show the scene if they fit one geometry."""
     _, (scale, _) = pair.both(COMPARED_SIDE_PX)
     found = Sources(pair).learned
     places, ends = (scaled_points(p, scale) for p in (found.points0, found.points1))
@@ -206,14 +206,14 @@ def _contradicted(
             overlay[label] = whole < max(MAX_SHIFT_PX, MIN_UNITY * each)
         return overlay
 
-    if not stands(still & known).any():  # checked before the matching, which takes longest
+    if not stands(still & known).any():  # checked first, because `matched` takes longest
         return nowhere
     exactly = still & known & (np.linalg.norm(shift, axis=2) < MAX_SHIFT_PX)
     places, ends, scene = matched(exactly)
     stays = np.linalg.norm(ends - places, axis=1) <= MAX_STILL_PX
     scene = scene & ~stays
     cells, moving_cells = (len(np.unique(places[k] // CELL_PX, axis=0)) for k in (stays, scene))
-    # If more of the image stands still than moves, something moves in front of a still camera.
+    # If still matches fill more of the image than moving ones, a still camera sees a moving object.
     if np.count_nonzero(scene) < NEIGHBOURS or (cells > moving_cells and not moves):
         return nowhere
     size = still.shape[::-1]

@@ -35,11 +35,11 @@ from .guided import Explanation, ImagePair
 from .overlay import scene_of, still_matches, tell_still
 
 GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
-"""The stages that `match_images` reports."""
+"""Names of the stages that `match_images` reports to `progress`, in this order."""
 
 MAX_RETURN_ERROR_PX = 2.0
-"""If `mutual`, images are matched both ways. A match is kept only if the reverse match that starts
-nearest to its end leads back to within this distance of its start. Chosen by hand."""
+"""With `mutual`, the second image is also matched to the first. A match is kept only if, of these,
+the one that starts nearest to its end leads back this near to its start. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -73,8 +73,8 @@ def match_images(
         ignore: a tuple with a mask or None for each image, or one mask for both images. A mask is
             true where no keypoint is wanted.
         model: the geometry, which also guides the matching: "homography" (planes, pure rotation),
-            "fundamental" (any static scene), "essential" (needs both cameras), or "auto": whichever
-            of "homography" and "fundamental" fits the images.
+            "fundamental" (any static scene), "essential" (needs the cameras in `options`), or
+            "auto": whichever of "homography" and "fundamental" fits the images.
         mutual: keep only one-to-one matches that are found in both directions, which takes twice
             the time. The order of the images then does not matter.
         tentative_matches: matches of another matcher (LightGlue, LoFTR, clicks), some of which may
@@ -119,7 +119,7 @@ def match_images(
     matches = _match_guided(pair, (keypoints0, keypoints1), given, *settings)
     matches = _unmasked(matches, pair, left_out)
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):
-        _require_pinholes((image0, image1), rgb, rim=True)  # homographies fit eyepieces as well
+        _require_pinholes((image0, image1), rgb, rim=True)  # homographies also fit round pictures
     if not (mutual and matches.success):
         return matches
     given = None if given is None else given[::-1]
@@ -148,9 +148,9 @@ def match_features(
             "exact" for few keypoints, otherwise "patchmatch" for dense ones and "flann" for others.
         filter_by: which nearest neighbours are matches: "ratio" keeps those that pass Lowe's ratio
             test; with "neighbours", a small network keeps those that move, rotate and scale as the
-            matches around them. The network gives more correct and fewer wrong matches. It needs at
-            least nine mutual neighbours, learned descriptors (not cross-modal) or RootSIFT, and
-            keypoints with sizes and angles.
+            matches around them, which gives more correct and fewer wrong matches than "ratio" does,
+            but needs at least nine mutual neighbours, learned descriptors (not cross-modal) or
+            RootSIFT, and keypoints with sizes and angles.
         ratio: maximum ratio of the descriptor distances to the nearest and the second-nearest
             neighbour. None: 0.91 for "learned", 0.9 for "cross-modal", 0.88 if otherwise learned,
             0.85 for all others. These limits are equally strict.
@@ -224,7 +224,7 @@ def match_features(
 
 
 def _noted(matches: Matches, left_out: float) -> Matches:
-    """Add a share of the image that is left out; above 1/2, turn "high" confidence into "fair"."""
+    """Note the share left out as still; if it exceeds 1/2, "high" confidence becomes "fair"."""
     if (geometry := matches.geometry) is None:
         return matches
     evidence = replace(geometry.evidence, left_out=left_out + geometry.evidence.left_out)
@@ -290,13 +290,13 @@ def _checked_positions(points: Any) -> Points:
 
 
 def _require_pinholes(images: tuple[Any, Any], rgb: Points, *, rim: bool) -> None:
-    """Raise an ImageError if one of two images was not taken by a pinhole camera."""
+    """Raise an ImageError if one of two images is a panorama, a fisheye or, with `rim`, round."""
     for number, image in enumerate(images):
         require_pinhole(image, rgb[number], rim=rim, name=f"images[{number}]")
 
 
 def _unmasked(matches: Matches, pair: ImagePair, left_out: float) -> Matches:
-    """Drop matches that end in a mask, as guided matches may, or that lie on a still overlay."""
+    """Drop matches with an end in an ignore mask, and those on an overlay that stands still."""
     ends, masks = (matches.points0, matches.points1), pair.masks
     dropped = at_pixels(masks[0], ends[0]) | at_pixels(masks[1], ends[1])
     if matches.geometry is not None and matches.geometry.model not in ("homography", "none"):

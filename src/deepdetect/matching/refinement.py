@@ -24,17 +24,17 @@ pair of HPatches are within 1 px after alignment, 722 and 309 before. A radius o
 and 395, but in trials a pose AUC at 1 degree of 0.646 on a KITTI clip, where 7 px gave 0.659."""
 
 BASE_SIGMA_PX = 0.8
-"""Minimum sigma of the blur of both images, which bilinear interpolation needs."""
+"""Minimum sigma of the blur of both images: bilinear interpolation needs smooth images."""
 
 SIGMAS_PX = 0.7, 1.0, 1.5, 2.0, 3.0
-"""The sharper image of a pair is blurred by one of these sigmas, or not at all: that with which a
-sample of patches correlates best. A wrong blur moves matches by up to half a pixel."""
+"""The sharper image of a pair is blurred by one of these sigmas, or not at all, whichever makes a
+sample of patches correlate best. A wrong blur moves matches by up to half a pixel."""
 
 SAMPLE = 128
 """Number of matches, evenly drawn, whose patches choose the blur. Chosen by hand."""
 
 CERTAIN = 0.95
-"""Matches that correlate at least this well try no other initial affinity. Chosen by hand."""
+"""Patches that correlate this well are not aligned again from another affine map. Set by hand."""
 
 MIN_SIGMA_PX = 0.05
 """Minimum standard deviation of an aligned position along each axis. Chosen by hand."""
@@ -119,7 +119,7 @@ def refine_matches(
 
 
 def _first_affinities(matches: Matches) -> Iterator[np.ndarray]:
-    """Yield (M, 2, 2) initial affinities: of a homography or none, then of sizes and angles."""
+    """Yield (M, 2, 2) initial affine maps: by a homography, or 1; then by sizes and angles."""
     geometry, count = matches.geometry, len(matches)
     if geometry is not None and geometry.model == "homography" and geometry.matrix is not None:
         yield homography_derivatives(matches.points0, geometry.matrix)
@@ -138,7 +138,7 @@ def _first_affinities(matches: Matches) -> Iterator[np.ndarray]:
 def _sigmas(
     grays: list[np.ndarray], points0: np.ndarray, points1: np.ndarray, starts: list[np.ndarray]
 ) -> tuple[float, float]:
-    """Return the sigmas of the blur of both images with which a sample of patches is most alike."""
+    """Return the blur sigma of each image (one is 0) that makes a sample of patches most alike."""
     rows = np.linspace(0, len(points0) - 1, min(SAMPLE, len(points0))).astype(int)
     some = points0[rows], points1[rows], [each[rows] for each in starts]
     ways = [*((sigma, 0.0) for sigma in SIGMAS_PX[::-1]), (0.0, 0.0)]

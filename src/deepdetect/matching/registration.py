@@ -35,7 +35,7 @@ from .pipeline import match_images
 Extent = Literal["reference", "union"]
 
 MAX_UNION = 4
-"""Maximum size of a union's frame, as a multiple of the pixels of both images. Chosen by hand."""
+"""With `extent="union"`, the frame has at most this many times both images' pixels. Set by hand."""
 
 SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""
@@ -52,7 +52,7 @@ class Registration:
             content. It is uint16 if the second image has more than 8 bits, otherwise uint8. A
             uint16 image keeps its numbers.
         valid: (H, W) bool, where the warped image has content.
-        matches: number of dense matches along the homography that were kept.
+        matches: number of matches found where the homography predicts them.
         zncc: median local ZNCC of both images over their overlap, in [-1, 1].
         origin: (x, y) of the frame's first pixel in the first image; (0, 0) except for "union".
         applied: the images of `apply_to` warped into the frame, (H, W, C) with all their bands and
@@ -207,7 +207,7 @@ def _union(
     corners = outer_corners((width, height))
     back = np.linalg.inv(homography)
     ends, depths = transform_points(corners, back), corners @ back[2, :2] + back[2, 2]
-    # A pixel belongs to an image if its centre lies inside the image.
+    # Only pixels whose centre lies inside an image belong to it: edges are rounded inwards.
     low = np.minimum(0, np.ceil(ends.min(axis=0)))
     high = np.maximum([shape0[1], shape0[0]], np.floor(ends.max(axis=0)) + 1)
     pixels = float(np.prod(high - low))

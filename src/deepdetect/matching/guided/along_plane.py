@@ -41,7 +41,7 @@ MAX_PARALLAX = 0.1
 where the homography maps it: the views differ too much there. Chosen by hand."""
 
 NOISE_PX = 1.0
-"""A track is on the plane if it ends nearer than this, three track errors, to its prediction."""
+"""A track is on the plane if it ends nearer than this, three times its error, to its prediction."""
 
 MAX_DISTANCE_PX = 1.0
 """A homography matches two keypoints if it maps the first to within this many full-size pixels of
@@ -70,7 +70,7 @@ NOTHING: Pair = np.empty((0, 2)), np.empty((0, 2))
 class PlaneTracks:
     """Corners and matches, (M, 2) in both images, tracked relative to the plane of a homography.
 
-    Corners start only where `free`, (rows, columns) bool for the cells of the image, is true.
+    Corners are tracked only where `free`, (rows, columns) bool over the image, is true.
 
     Attributes:
         homography: (3, 3), fitted to the tracks if the fit is validated, otherwise as given.
@@ -142,7 +142,7 @@ class PlaneTracks:
 def match_along_plane(
     pair: ImagePair, pixels: Pair, homography: np.ndarray, judge: Judge, evidence: Evidence
 ) -> GuidedMatches:
-    """Match keypoints on whole pixels, (N, 2) and (M, 2), in the cells of `evidence.believed`."""
+    """Match keypoints, (N, 2) and (M, 2) whole pixels, where the images agree with a homography."""
     predicted = transform_points(pixels[0], homography)
     indices1, distances = nearest_keypoints(predicted, pixels[1], pair.sizes[1])
     indices0 = np.flatnonzero(distances < MAX_DISTANCE_PX)

@@ -52,8 +52,8 @@ disparities are searched in reduced copies, to bound time and memory. They are t
 rectified images themselves."""
 
 MAX_STEP_PX = 4.0
-"""If disparities are searched in coarser steps than this, those near a known plane are also
-searched alone, in finer steps. The result with more matches is kept."""
+"""If the search steps are coarser than this, disparities near the plane of a known homography are
+also searched alone, in finer steps. The result with more matches is kept."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """The range of disparities is extended at both ends by MARGIN_PX plus MARGIN_FRACTION of its
@@ -68,8 +68,8 @@ of search steps (pixels). The limit is loose, because sparse matches come from a
 Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_AGREEMENT = 0.6
-"""This fraction of the sparse matches, or more, must agree with the disparity map. The limit is not
-higher, since on facades a quarter of them end one window farther along the epipolar line."""
+"""This fraction of the sparse matches or more must agree with the disparity map. It is not higher,
+since on a facade of equal windows a quarter of them end one window off on their epipolar line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def match_by_rectification(
 def _best_view(
     grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None
 ) -> tuple[RectifiedView, Pair] | None:
-    """Match rows, over all disparities or near a plane; return the denser view, and its tracks."""
+    """Match rows, over all disparities or near a plane; return the denser result and its tracks."""
     ways, best, most = [sparse], None, 0.0
     if plane is not None:
         reach_px = MAX_PARALLAX * max(grays[0].shape)
@@ -157,7 +157,7 @@ def _best_view(
 def rectified_view(
     grays: Pair, sparse: Pair, fundamental: np.ndarray, plane: np.ndarray | None = None
 ) -> RectifiedView | None:
-    """Rectify both images, and match their rows."""
+    """Rectify both images and match their rows; None if that fails or the views do not overlap."""
     ways = [None] if plane is None else [plane, None]
     frames = [(_frame(grays, sparse, fundamental, way, 1.0), way) for way in ways]
     volumes = [np.inf if each is None else _volume(each, sparse) for each, _ in frames]
@@ -180,7 +180,7 @@ def rectified_view(
     (first, shown0), (second, shown1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
     disparity, matched, step_px = _match_rows((first, second), searched)
     correlation = _correlation((first, second), (shown0, shown1), disparity, matched)
-    # By chance, as many correlations are below 0 as above; those below 0 are dropped.
+    # Wrong matches correlate below 0 as often as above it, so all matches below 0 are dropped.
     disparity = np.where(matched & (correlation >= 0), disparity, np.float32(np.nan))
     return RectifiedView(frame, scale, step_px, (first, second), disparity, correlation)
 

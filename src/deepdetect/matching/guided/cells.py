@@ -1,4 +1,4 @@
-"""Divide both images of a pair into cells with descriptors, by which geometries are compared."""
+"""Divide two images into cells, one descriptor every 4 pixels, by which geometries are compared."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from ...features.sift import dense_sift, sift_gradient, to_root_sift
 from ...geometry.transforms import scaling_matrix
 
 SIDE_PX = 480
-"""Images are scaled to this longer side before they are compared, so that cells have one size
-relative to the image. A homography that is off by 3 of 640 pixels still aligns the cells."""
+"""Images are scaled to this longer side before they are compared, so that a descriptor covers the
+same part of any image. A homography that is off by 3 of 640 pixels still aligns the descriptors."""
 
 CELL_PX, SIZES_PX = 4, (2.5, 4.5)
-"""Cells are CELL_PX pixels apart, and described by RootSIFT at two keypoint diameters, SIZES_PX. A
-descriptor covers six diameters. Diameters of 3 and 6 px blur the outlines of small planes. With
-diameters below SIZES_PX, fewer cells match in darkness and fog."""
+"""Images are described at cells, CELL_PX pixels apart, by RootSIFT at two keypoint diameters,
+SIZES_PX. A descriptor covers six diameters. With 3 and 6 px, outlines of small planes are blurred;
+with less than SIZES_PX, fewer descriptors match in darkness and fog."""
 
 WINDOW_CELLS = 16
-"""Number of cells in a window of 16 x 16 pixels. Explained parts of images are counted in windows,
-because adjacent cells share most of their pixels."""
+"""Number of cells, 4 px apart, in a window of 16 x 16 pixels. Areas that a geometry explains are
+counted in windows, because the descriptors of adjacent cells share most of their pixels."""
 
 MIN_WINDOWS_AROUND = 5
-"""The place of a window is predicted if this many of its eight neighbours hold matches."""
+"""Matches predict where a 16 x 16 px window lies if this many of its 8 neighbours hold some."""
 
 MARGIN_PX = 9
-"""Cells closer than this to the border of an image or of an ignored area are not compared: their
-descriptors mostly show the border, and borders at the same place are no evidence."""
+"""Descriptors closer than this to the border of an image or of an ignored area are not compared:
+they mostly show the border, and two borders at the same place are no evidence."""
 
 
 def enlarged(gray: np.ndarray, scale: float) -> tuple[np.ndarray, float]:
@@ -50,7 +50,7 @@ def shown_parts(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def at_cells(mask: np.ndarray) -> np.ndarray:
-    """Sample an (H, W) mask at the centres of the cells."""
+    """Sample an (H, W) mask every `CELL_PX` pixels, where descriptors lie: (rows, columns)."""
     return mask[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
 
 
@@ -100,7 +100,7 @@ def gathered(
 
 
 def mean_gradient(gray: np.ndarray) -> np.ndarray:
-    """Return the mean gradient, a difference of pixels two apart, in 24 x 24 pixels around each."""
+    """Return the mean gradient (difference of pixels two apart) in 24 x 24 px around each pixel."""
     side = 3 * round(WINDOW_CELLS**0.5) * CELL_PX // 2
     return cv2.boxFilter(sift_gradient(gray)[0], -1, (side, side))
 
@@ -119,9 +119,9 @@ def mean_around(values: np.ndarray) -> np.ndarray:
 def predicted(
     points0: np.ndarray, points1: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions that matches predict for pixels, (H, W, 2) float32, and which are known.
+    """Return pixels' positions in the second image, (H, W, 2) float32, and which are known.
 
-    Each window is placed by an affine map, fitted to the matches in the eight windows around it.
+    Each 16 x 16 px window is mapped by an affinity fitted to matches in the 8 windows around it.
     """
     side = CELL_PX * round(WINDOW_CELLS**0.5)
     rows, columns = (-(-length // side) for length in shape)

@@ -1,8 +1,8 @@
 """Judge geometries: images must agree with a geometry more than with displaced copies of it.
 
-A geometry warps the second image into the frame of the first. Both are divided into cells. RootSIFT
-descriptors of both images at each cell correlate where they show the same place. A cell is
-explained if its correlation, averaged over its neighbours, is above that of nearly all cells of
+A geometry warps the second image into the frame of the first. Both are divided into cells, 4 px
+apart. RootSIFT descriptors of both images at a cell correlate if they show the same place. A cell
+is explained if its correlation, averaged over its neighbours, is above that of nearly all cells of
 copies that are displaced by a quarter of the image or more.
 
 On repeated patterns (windows, tiles, fences), a copy that is displaced by a period aligns cells as
@@ -45,36 +45,36 @@ from .cells import (
 from .image_pair import ImagePair, Pair
 
 DIMENSIONS = 64
-"""Descriptors of both images are reduced from 256 to 64 principal components of those of the first
-image, so that correlations take a quarter of the time."""
+"""Descriptors of both images are reduced from 256 numbers to the first 64 principal components of
+those of the first image, so that correlations take a quarter of the time."""
 
 FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
-"""A cell is explained if less than FALSE_POSITIVE_RATE of the cells of displaced copies correlate
-as well. A cell is contradicted if at least CONTRADICTING_RATE of those cells have surroundings that
-correlate as well as its surroundings: doubt needs less evidence than trust. Chosen by hand."""
+"""A geometry explains a cell (a descriptor, 4 px from the next) if under FALSE_POSITIVE_RATE of the
+cells of copies displaced by `FAR` correlate as well. It contradicts a cell if CONTRADICTING_RATE or
+more of those have surroundings that correlate as well as the cell's surroundings. Set by hand."""
 
 FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
 """The second image shifted by plus or minus these fractions of its width and height gives the
 correlations that occur by chance in this pair."""
 
 MIN_PERIOD = 3
-"""Copies are displaced by this many cells or more: descriptors of nearer cells overlap."""
+"""A pattern's period is searched from this many cells (4 px) on: nearer descriptors overlap."""
 
 MIN_SIMILARITY, MAX_COPIES, MIN_OVERLAP = 0.4, 4, 0.5
 """A displaced copy is compared with a geometry if its correlation over the whole image is at least
 MIN_SIMILARITY times the geometry's, and MIN_OVERLAP of the overlap remains. Copies reach up to 0.3
 of the geometry's on planes of Oxford, 0.6 or more on facades of one repeated window. At most
-MAX_COPIES are compared, because each point of a lattice has four nearest neighbours."""
+MAX_COPIES are compared: a pattern is a lattice, whose points have four nearest neighbours."""
 
 MIN_WON, MIN_WON_RATIO = 0.0125, 1.5
-"""A geometry must explain at least MIN_WON of its cells clearly better than a displaced copy does,
-and MIN_WON_RATIO times as many as the copy explains better. The fraction of cells is at least 0.03
-on facades with one odd window, and 0.017 on a truss. On facades whose windows are all alike, it is
-up to 0.012 for some copy."""
+"""To be preferred to a displaced copy, a geometry must explain the fraction MIN_WON of its cells
+clearly better, and MIN_WON_RATIO times as many cells as the copy explains better. The fraction is
+at least 0.03 on facades with one odd window, and 0.017 on a truss. On facades whose windows are all
+alike, it is at most 0.012 for at least one copy."""
 
 MIN_TIED = 0.5
-"""A copy competes with a geometry if it explains at least this fraction of the geometry's cells as
-well. A copy that explains only the road of a street does not compete."""
+"""A displaced copy of a geometry is a rival if it explains as well at least this fraction of what
+the geometry explains. A copy that explains only the road of a street is none."""
 
 MIN_STRUCTURE, MIN_GRADIENT = 0.5, 4.0
 """Limits of the mean difference of pixels two apart, in grey levels. Places below MIN_STRUCTURE in
@@ -82,14 +82,14 @@ both images are flat and not compared. Places above MIN_GRADIENT in both show mo
 noise of 5 grey levels, as of a phone at night, leaves 2 after the reduction and the blur."""
 
 MIN_WINDOWS, MIN_SHARE = 8.0, 0.1
-"""The images confirm a geometry if it explains at least MIN_WINDOWS windows (of 16 cells), and
-MIN_SHARE of the compared cells. Geometries of unrelated photographs explain up to 0.07 of the
-cells. Correct ones of long strips of photographs, in other light, explain 8 windows or more."""
+"""The images confirm a geometry if it explains at least MIN_WINDOWS windows of 16 x 16 px, and the
+fraction MIN_SHARE of what is compared. Geometries of unrelated photographs explain up to 0.07 of
+it. Correct ones of long strips of photographs, in other light, explain 8 windows or more."""
 
 MIN_AGREEMENT, CLEAR_CORRELATION = 0.75, 0.5
 """Two images contradict a geometry if less than MIN_AGREEMENT of their structure agrees with it,
 unless their median correlation is CLEAR_CORRELATION or more: in other light, as by night, the rest
-may differ. Street views 5 m apart in which only the road fits have at most 0.74 and 0.48."""
+may differ. If only the road fits (street views), agreement reaches 0.74 and correlation 0.48."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,8 @@ class Evidence:
     def believed(self) -> np.ndarray:
         """(rows, columns) bool, true in the cells whose matches are kept: the explained ones.
 
-        At the border, explained cells nearby decide. If too little is compared, all are kept.
+        Cells too near the border to be compared are true if explained ones are near; all are true
+        if too little is compared to judge the geometry.
         """
         if not self.compares:
             return np.ones(self.similarity.shape, bool)
@@ -201,7 +202,7 @@ class Judge:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of cells."""
+        """Number of rows and columns of cells in the first image."""
         rows, columns = self._described[1].shape[:2]
         return rows, columns
 
@@ -270,7 +271,7 @@ class View:
 
     @cached_property
     def evidence(self) -> Evidence:
-        """How well the geometry explains the image."""
+        """The correlation of each cell, and the limits that displaced copies (`FAR`) set."""
         rows, columns = self._valid.shape
         far = [
             self._displaced(round(sign * x * columns), round(sign * y * rows))
@@ -304,7 +305,7 @@ class View:
         for shift in self._similar_shifts():
             move, field = self._refined(shift)
             if np.abs(np.median(field, axis=(0, 1))).max() < MIN_PERIOD:
-                continue  # the refinement undid the shift
+                continue  # after its refinement, the copy is the geometry itself
             near = gathered(self._first, self._second, self._valid, field)
             with np.errstate(invalid="ignore"):
                 tied = self.evidence.explained & (own - near < 2 * spread)
@@ -351,11 +352,11 @@ class View:
         return gathered(self._first, self._second, self._valid, field)
 
     def _similar_shifts(self) -> np.ndarray:
-        """Return the displacements (x, y), in cells, at which the images also correlate well."""
+        """Return displacements (x, y), in cells, at which the images correlate nearly as well."""
         rows, columns = self._valid.shape
         size = cv2.getOptimalDFTSize(2 * rows), cv2.getOptimalDFTSize(2 * columns)
         valid = self._valid.astype(np.float64)
-        some = slice(-24, None)  # the 24 main components suffice to find periods
+        some = slice(-24, None)  # the 24 main components of descriptors suffice to find periods
         first, second = (
             np.fft.rfft2(cells[..., some], size, axes=(0, 1))
             for cells in (self._first, self._second * self._valid[..., None])
@@ -373,10 +374,10 @@ class View:
         return shifts[np.abs(shifts).max(axis=1) >= MIN_PERIOD][:MAX_COPIES]
 
     def _refined(self, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the homography, between positions in cells, of a copy near a shift, and its field.
+        """Return the homography of a displaced copy near a shift, and each cell's displacement.
 
-        In a tilted view, the periods of a pattern are not all alike: the best displacements nearby
-        give a homography.
+        In a tilted view, the periods of a pattern are not all alike: a homography, in units of
+        cells, is fitted to the best displacement near the shift at each cell.
         """
         rows, columns = self._valid.shape
         y, x = np.indices((rows, columns))

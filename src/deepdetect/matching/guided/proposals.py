@@ -27,19 +27,19 @@ from .image_pair import ImagePair, Pair
 from .simulated_views import simulated_views
 
 LEARNED_SIDE_PX, LEARNED_KEYPOINTS = 640, 2048
-"""The first source reduces the images to this longer side and finds this number of points in each.
+"""The first matches come from images of this longer side, with this number of points in each.
 These points gave 655 of the 796 right answers for the 1,050 test pairs of `lab/acceptance`."""
 
 DENSE_SIDE_PX, DENSE_KEYPOINTS = 1280, 8192
-"""The second source finds this number of points in images of this longer side. It gave 25 more of
-the 796 right answers for the 1,050 test pairs of `lab/acceptance`."""
+"""If the images confirm no geometry of the first matches, this number of points is found in images
+of this longer side. That gave 25 more of the 796 right answers of `lab/acceptance`."""
 
 GIVEN_SIDE_PX = 1200
 """Matches that the caller gives are assumed to be as exact as in images of this longer side."""
 
 VIEWED_SIDE_PX, VIEWED_KEYPOINTS = 320, 1000
 """Each image, with this longer side and number of points, is compared with 8 oblique views of the
-other, each with half as many points. The 16 views then take as long as the second source."""
+other, each with half as many points. The 16 views then take as long as DENSE_KEYPOINTS points."""
 
 TENTATIVE_RATIO = 0.95
 """Limit of the ratio test of learned descriptors for tentative matches. It is loose, because the
@@ -172,7 +172,7 @@ class Sources:
 
     @cached_property
     def dense(self) -> Tentative:
-        """Matches of more learned points than `learned`, in larger copies of the images."""
+        """Matches of `DENSE_KEYPOINTS` points in copies whose longer side is `DENSE_SIDE_PX`."""
         return self._matched(self._extract(DENSE_SIDE_PX, DENSE_KEYPOINTS), DENSE_SIDE_PX)
 
     def _views(self) -> Tentative:

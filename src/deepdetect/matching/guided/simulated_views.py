@@ -24,7 +24,7 @@ BLUR = 0.8
 """Sigma of the blur before compression, in pixels per sqrt(tilt^2 - 1), as in ASIFT (2009)."""
 
 ROUNDING = 1e-9
-"""Image sizes are rounded up, but not for a fraction of a pixel below this rounding error."""
+"""Image sizes are rounded up unless they exceed a whole number by less than this rounding error."""
 
 OUTSIDE: dict[str, Any] = {"borderValue": 128}
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..._shared.kernels import compiled
 
 END = np.uint16(30000)
-"""Cost of disparities outside the searched range: above any sum, with a penalty below 2^16."""
+"""Cost of disparities outside the searched range: above any sum, below 2^16 even with a penalty."""
 
 BLOCK = 128
 """Number of pixels of a row that are processed together, so that the sums stay in the L1 cache."""
@@ -140,7 +140,7 @@ def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # typ
     lines[:, :, 0] = lines[:, :, count + 1] = END
     leasts = np.zeros(paths, np.uint16)
     tones = np.zeros(paths, np.uint8)
-    for k in range(paths * steps):  # in the order in memory
+    for k in range(paths * steps):  # pixels in the order in which memory holds them
         if down:
             step, path = k // paths, k % paths
             y = step if down == 1 else height - 1 - step
@@ -172,7 +172,7 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
     """
     width = total.shape[1]
     best = np.empty(width, np.int64)
-    keys = np.empty(width, np.uint32)  # by column of the mirrored right row: cost and disparity
+    keys = np.empty(width, np.uint32)  # per column of the mirrored right row: 2^16 cost + index
     for y in range(first, last):
         keys[:] = np.uint32(0xFFFFFFFF)
         for x in range(width):
@@ -191,7 +191,7 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
                 least = min(least, sums[d])
             for d in range(high, count):
                 least = min(least, sums[d])
-            # A match inside is preferred to one outside with the same cost.
+            # A match inside the right image is preferred to one outside with the same cost.
             seen = low < high and inside == least
             at = np.int64(first_inside & np.uint32(0xFFFF)) if seen else np.int64(0)
             while sums[at] != least:

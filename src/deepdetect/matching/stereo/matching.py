@@ -52,7 +52,7 @@ TAIL_FRACTION = 0.01
 
 SEARCH_MARGIN_PX, SEARCH_MARGIN_FRACTION = 1.5, 0.2
 """A disparity range found on small copies is extended at both ends by SEARCH_MARGIN_PX (pixels of
-the copy) and SEARCH_MARGIN_FRACTION of its length, as some objects are too small for the copy."""
+the copy) and SEARCH_MARGIN_FRACTION of its length: small objects vanish in the copies."""
 
 
 @suggest_keywords

@@ -147,7 +147,7 @@ def matching_cost(
 
     left, right = censuses
     cost = np.empty((*left.shape, count), np.uint8)
-    # In the mirrored view, larger disparities are at higher addresses.
+    # Mirrored, the right view's pixels of rising disparities have rising addresses, for speed.
     mirrored = np.ascontiguousarray(right[:, ::-1])
     parallel_for(len(left), cost_rows, left, mirrored, min_disparity, np.uint8(outside), cost)
     return cost

@@ -121,7 +121,7 @@ def adjust_cameras(
         for number, column in columns.items():
             normal[column + 3, column + 3] += FOCAL_WEIGHT
             right[column + 3] -= FOCAL_WEIGHT * np.log(focals[number] / common)
-        step = np.linalg.lstsq(normal, right, rcond=None)[0]  # a common rotation is undetermined
+        step = np.linalg.lstsq(normal, right, rcond=None)[0]  # singular: all may rotate together
         for number, column in columns.items():
             rotations[number] = rotations[number] @ cv2.Rodrigues(step[column : column + 3])[0]
             focals[number] *= float(np.exp(step[column + 3]))

@@ -116,7 +116,7 @@ def plan_plane(
                 "projection 'cylindrical'"
             )
     placed = {number: scaled_homography(matrix, 1, scale) for number, matrix in placed.items()}
-    # A pixel belongs to an image if its centre lies inside the image.
+    # Only pixels whose centre lies inside an image belong to it: edges are rounded inwards.
     edges = {n: transform_points(outer_corners(sizes[n]), matrix) for n, matrix in placed.items()}
     low = np.ceil(np.min([edge.min(0) for edge in edges.values()], axis=0))
     boxes = {}

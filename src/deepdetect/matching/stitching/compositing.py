@@ -46,8 +46,8 @@ def composite(
     """Composite images on a canvas.
 
     `load` returns an image by its number, (H, W, 3) RGB, uint8 or uint16; it is called once per
-    box. `small` holds a reduced uint8 copy of each image, and its scale. Pixels that stand
-    `still`, (h, w) bool, are drawn from one image, and only where none shows the scene. Returns the
+    box. `small` holds a reduced uint8 copy of each image, and its scale. Pixels that stand still in
+    all images (`still`, (h, w) bool) are drawn only where no image shows the scene. Returns the
     panorama, black outside all images and uint16 if any image is; its mask; the gain of each image;
     and, for each pair with visible parallax, its displacement along the seam in panorama pixels.
     """

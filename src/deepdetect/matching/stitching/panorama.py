@@ -77,7 +77,7 @@ class Panorama:
             pairs where it is visible because the camera moved between them.
         closed: whether the panorama shows 360 degrees, and its right border continues at the left.
         value_range: the values of black and white in `image`, if it is uint16.
-        left_out: share that stands still in all images, drawn only where none shows the scene.
+        left_out: share of each image that stands still in all, drawn where none shows the scene.
     """
 
     image: np.ndarray

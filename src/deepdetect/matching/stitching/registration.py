@@ -44,8 +44,8 @@ MAX_KEYPOINTS = 30_000
 """Maximum number of dense keypoints per image that confirm a homography. Chosen by hand."""
 
 MIN_PARTNERS = 3
-"""A pair is not registered if other pairs already connect its images and each image has at least
-this many registered partners, since a registration takes time."""
+"""To save time, a pair is not registered if other pairs already connect its images and each image
+has at least this many registered partners."""
 
 MIN_OVERLAP = 0.1
 """An unregistered pair is tried again if the joint fit maps at least this fraction of one image's
@@ -58,8 +58,8 @@ MAX_CORRESPONDENCES = 400
 """Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MIN_STILL = 0.9
-"""If two images agree without any motion on less than this fraction of what both show, only a menu
-or a caption stands still. Images taken with a still camera agree nearly everywhere."""
+"""If two images, laid on each other unmoved, agree on less than this fraction of what both show,
+only a menu or a caption stands still. Images of a still camera agree nearly everywhere."""
 
 MIN_EXPLAINED = 0.3
 """Two images must agree, along a homography, on at least this fraction of what both show. Wrong
