@@ -372,7 +372,7 @@ class AppServer:
         path = self._job(request).file(request.path_params["file"])
         if path is None:
             raise HTTPException(404, "there is no such file")
-        if path.suffix == ".html":  # a frame sends no key, but the task's name is secret
+        if path.suffix == ".html":  # an iframe sends no key, but the task's name is secret
             return FileResponse(path, headers={"Content-Security-Policy": VIEWER_POLICY})
         self._check_key(request)
         return FileResponse(path)

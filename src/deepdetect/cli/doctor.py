@@ -24,13 +24,13 @@ PURPOSES = {
     "sfm": "reconstruct with three or more images, extract, match-many, export, georeferences",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
-"""Probabilities of two back ends may differ by this much: five times the usual 0.001."""
+"""Probabilities of two back ends may differ by this much, five times the usual difference."""
 TIMED_ROUNDS = 5
 """The benchmark times this many runs, after one that compiles functions. Chosen by hand."""
 NEAR_SHIFT_PX = 16
 """Disparity in pixels of the foreground in the second pair of the self-test. Chosen by hand."""
 MIN_PRECISION = 0.95
-"""The self-test fails below this fraction of matches correct to 1 px, usually 1. Chosen by hand."""
+"""The self-test fails if fewer matches are correct to 1 px; usually all are. Chosen by hand."""
 
 
 class Finding(NamedTuple):

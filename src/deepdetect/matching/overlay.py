@@ -41,14 +41,14 @@ MIN_MOTION_PX, which few do at the far end of a street along which the camera dr
 MIN_AREA_PX, MIN_CLEAR_SHARE = 128, 0.67
 """A still region is an overlay if the scene clearly moves at the fraction MIN_CLEAR_SHARE of it,
 and if MIN_AREA_PX of its pixels (half a word of a caption) look different where the scene moves to.
-WINDOW_PX^2 of these pixels are enough if they shift by less than MAX_SHIFT_PX: in 177 real pairs
-without an overlay, no pixel does so, in a time stamp 62 do, on a car's bonnet 7,000."""
+WINDOW_PX^2 of these pixels are enough if they shift by less than MAX_SHIFT_PX: in 177 real pairs,
+no pixel does so, in a time stamp 62 do, on a car's bonnet 7,000."""
 
 MAX_SHIFT_PX, MIN_UNITY, MIN_ROUNDNESS = 0.15, 0.6, 0.5
 """A region is distant scene, not an overlay, if its median shift vector is longer than MAX_SHIFT_PX
-and than MIN_UNITY times the median length of the shifts around its pixels: shifts within a text
-point in all directions. A shift is known if its window's structure tensor has a determinant above
-MIN_ROUNDNESS times the squared half trace, because an edge that moves along itself looks still."""
+and than MIN_UNITY times the median length of its pixels' shifts: shifts within a text differ. A
+pixel's shift is known if its window's structure tensor has a determinant above MIN_ROUNDNESS times
+the squared half trace, because an edge that moves along itself looks still."""
 
 CELL_PX = 32
 """The motion of the scene is interpolated between the centres of squares of this side. The areas of
@@ -104,7 +104,7 @@ def tell_still(share: float) -> None:
 def still_matches(
     pair: ImagePair, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return which matches lie on still overlays, (K,) bool, and the image share of the overlays."""
+    """Return which matches lie on a still overlay, (K,) bool, and the image share it fills."""
     small, scales = pair.both(COMPARED_SIDE_PX)
     still = _same(*small) if pair.sizes[0] == pair.sizes[1] else np.zeros(1, bool)
     if np.count_nonzero(still) < MIN_AREA_PX:

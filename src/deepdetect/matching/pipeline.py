@@ -38,8 +38,8 @@ GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
 """Names of the stages that `match_images` reports to `progress`, in this order."""
 
 MAX_RETURN_ERROR_PX = 2.0
-"""With `mutual`, the second image is also matched to the first. A match is kept only if, of these,
-the one that starts nearest to its end leads back this near to its start. Chosen by hand."""
+"""If `mutual`, the second image is also matched to the first. A match is kept only if the reverse
+match that starts nearest to its end leads back this near to its start. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -73,8 +73,8 @@ def match_images(
         ignore: a tuple with a mask or None for each image, or one mask for both images. A mask is
             true where no keypoint is wanted.
         model: the geometry, which also guides the matching: "homography" (planes, pure rotation),
-            "fundamental" (any static scene), "essential" (needs the cameras in `options`), or
-            "auto": whichever of "homography" and "fundamental" fits the images.
+            "fundamental" (any static scene), "essential" (needs both cameras), or "auto": whichever
+            of "homography" and "fundamental" fits the images.
         mutual: keep only one-to-one matches that are found in both directions, which takes twice
             the time. The order of the images then does not matter.
         tentative_matches: matches of another matcher (LightGlue, LoFTR, clicks), some of which may
@@ -148,8 +148,8 @@ def match_features(
             "exact" for few keypoints, otherwise "patchmatch" for dense ones and "flann" for others.
         filter_by: which nearest neighbours are matches: "ratio" keeps those that pass Lowe's ratio
             test; with "neighbours", a small network keeps those that move, rotate and scale as the
-            matches around them, which gives more correct and fewer wrong matches than "ratio" does,
-            but needs at least nine mutual neighbours, learned descriptors (not cross-modal) or
+            matches around them. This gives more correct and fewer wrong matches than "ratio", but
+            needs at least nine mutual neighbours, learned descriptors (not cross-modal) or
             RootSIFT, and keypoints with sizes and angles.
         ratio: maximum ratio of the descriptor distances to the nearest and the second-nearest
             neighbour. None: 0.91 for "learned", 0.9 for "cross-modal", 0.88 if otherwise learned,

@@ -304,7 +304,7 @@ def sor_inliers_on_grid(
     if not len(pixels):
         return np.ones(0, bool)
     places = np.rint(pixels).astype(np.int64)
-    middle = float(np.median(disparity))  # squares of large numbers would lose small differences
+    middle = float(np.median(disparity))  # subtracted: large squares would lose small differences
     centred = (disparity - middle).astype(np.float64)
     others, total, squares = (
         window_sums(places, values, size[::-1], SOR_WINDOW_PX)

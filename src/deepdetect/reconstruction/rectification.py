@@ -39,7 +39,7 @@ GRID_SIZE_PX = 8
 """A pair is tested with one match per square of this side in the left image. Chosen by hand."""
 
 MIN_COARSE_INLIERS = 50
-"""Small copies of the images can only decide if this many matches fit a fundamental matrix."""
+"""Small copies can show a pair as not rectified if this many matches fit a fundamental matrix."""
 
 MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
 """The focal lengths of rectified views may differ by at most this fraction, so that values rounded
@@ -157,7 +157,7 @@ def detect_rectification(
     spread = np.quantile(disparity, [0.05, 0.5, 0.95]) if len(disparity) else np.full(3, np.nan)
     on_rows_count, best = (int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers))
     reason = ""
-    # "On the same row" has no fitted parameters, so the NFA of a fundamental matrix is stricter.
+    # "On the same row" has no fitted parameters, so a fundamental matrix's NFA is strict enough.
     if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     elif on_rows_count < MIN_INLIER_RATIO * best:

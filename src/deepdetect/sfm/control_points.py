@@ -90,7 +90,7 @@ def _parsed(lines: Iterable[str]) -> list[ControlRow]:
     known = np.isfinite([longitude, *xy]).all() and (abs(latitude) <= 90).all()
     if not (len(rows) and known and all(row[5] for row in rows)) or np.isinf(z).any():
         raise ValueError(f"there are no points, or one lies outside {system} or has no image")
-    # Zones are used beyond their borders, so points may be off by the size of the area of use.
+    # Zones are used beyond their borders, so points may lie outside by a zone's own size.
     if area := crs.area_of_use:
         width = (area.east - area.west) % 360 or 360
         aside = np.median((longitude - area.west + width) % 360)

@@ -29,7 +29,7 @@ Ratios below `MIN_GAIN` are raised to `MIN_GAIN`, so that the shift does not bec
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write to `line` (D, W) the sums of row y's two least Hamming distances to neighbours."""
+    """Write to `line` (D, W) sums of the two least Hamming distances to neighbours, for row y."""
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
     for d in range(count):

@@ -49,8 +49,8 @@ them at each end, which may be wrong. The range is then extended at each end by 
 its length, but not below `MIN_FAR` times the smallest inverse depth. Chosen by hand."""
 
 MAX_APPROACH = 0.5
-"""The search aligns all images at one depth in the first image. This depth is so large that no
-other camera has moved ahead by more than this fraction of it. Chosen by hand."""
+"""The search first warps all images to the first at one depth. This depth is so large that no other
+camera lies ahead of the first by more than this fraction of it. Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
 """A step of the search through inverse depths moves matches by one pixel, at this quantile of all

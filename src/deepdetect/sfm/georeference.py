@@ -41,7 +41,7 @@ MAX_SCALE_STD, MAX_HEADING_STD_DEG = 0.25, 20.0
 deviation of its direction to north, are below these limits. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""A note says if the positions alone leave some rotation's standard deviation above this."""
+"""A note warns if the positions alone leave the standard deviation of a rotation above this."""
 
 GRAVITY_STD_DEG, UPRIGHT_STD_DEG, AHEAD_STD_DEG = 2.0, 5.0, 25.0
 """Assumed standard deviations: of a gimbal's angles; without a gimbal, of image rows from level,
@@ -56,7 +56,7 @@ MAX_DISTANCE_PX = 15.0
 of the given pixel. Chosen by hand."""
 
 MAX_BEND = 0.05
-"""A bend explains residuals up to this fraction of the control points' extent. Chosen by hand."""
+"""A bent model can explain residuals up to this fraction of the points' extent. Chosen by hand."""
 
 READINGS: dict[str, tuple[list[int], float]] = {
     "heights are in feet": ([0, 1, 2], 0.3048),
@@ -252,7 +252,7 @@ def _place(
     scale: float | None,
     error: float | None = None,
 ) -> Georeference:
-    """Fit a model's `points` to geographic `places`; control points have an `error` in its unit."""
+    """Fit `points` of a model to `places`; `error` is that of control points, in model units."""
     unknown = np.isnan(places[:, 2])
     places = np.where(np.isnan(places), 0 if unknown.all() else np.nanmedian(places[:, 2]), places)
     places[:, 1] = np.unwrap(places[:, 1], period=360)

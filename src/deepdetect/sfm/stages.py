@@ -253,7 +253,7 @@ class Stages:
                 if name in described:
                     width, height = file[name]["image_size"][()]
                     wide = width >= MIN_ASPECT * height
-                    looked = wide or not sizes  # a fisheye's rim, until one image has none
+                    looked = wide or not sizes  # for a fisheye's circle, until an image has none
                     try:
                         require_pinhole(path, load_image(path) if looked else None)
                     except ValueError as error:

@@ -39,11 +39,11 @@ the direction to that camera exceeds `MIN_FACING`, its area there changes by a f
 `MAX_GROWTH`, and the images share at least `MIN_COMMON_POINTS` points. Chosen by hand."""
 
 DENSE_CELLS, MIN_DISTANCE_PX = 4500, 3
-"""An image is divided into about `DENSE_CELLS` squares. In each, at most one dense track begins,
-farther than `MIN_DISTANCE_PX` from all earlier tracks in the image. Chosen by hand."""
+"""An image is divided into about `DENSE_CELLS` squares. In each, at most one dense point begins a
+track, farther than `MIN_DISTANCE_PX` from all earlier tracks in the image. Chosen by hand."""
 
 MIN_DENSE_VIEWS = 3
-"""A dense track needs at least this number of images: a third image checks the match of two."""
+"""A track of a dense point needs at least this many images: a third one checks the match of two."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
 """Images are cached, because successive images share neighbours: at least `CACHED_IMAGES` images,

@@ -35,7 +35,7 @@ MAX_FPS = 1000.0
 """If a file states a higher frame rate, `FOLDER_FPS` is assumed instead. Chosen by hand."""
 
 EQUAL_FRAMES = 4
-"""Once this many frames equal the one before, `_SecondReader` checks that they do in the file."""
+"""If this many frames equal the one before, `_SecondReader` checks that the file repeats them."""
 
 SINGLE = "has a single frame: give a video, or a folder of frames"
 

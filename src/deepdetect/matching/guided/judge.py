@@ -67,10 +67,10 @@ of the geometry's on planes of Oxford, 0.6 or more on facades of one repeated wi
 MAX_COPIES are compared: a pattern is a lattice, whose points have four nearest neighbours."""
 
 MIN_WON, MIN_WON_RATIO = 0.0125, 1.5
-"""To be preferred to a displaced copy, a geometry must explain the fraction MIN_WON of its cells
-clearly better, and MIN_WON_RATIO times as many cells as the copy explains better. The fraction is
-at least 0.03 on facades with one odd window, and 0.017 on a truss. On facades whose windows are all
-alike, it is at most 0.012 for at least one copy."""
+"""A geometry must explain at least the fraction MIN_WON of its cells clearly better than each
+displaced copy, and MIN_WON_RATIO times as many as the copy explains better. The fraction is 0.03 or
+more on facades with one odd window, 0.017 on a truss; on facades whose windows are all alike, some
+copy leaves 0.012 or less."""
 
 MIN_TIED = 0.5
 """A displaced copy of a geometry is a rival if it explains as well at least this fraction of what
@@ -376,8 +376,7 @@ class View:
     def _refined(self, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the homography of a displaced copy near a shift, and each cell's displacement.
 
-        In a tilted view, the periods of a pattern are not all alike: a homography, in units of
-        cells, is fitted to the best displacement near the shift at each cell.
+        Periods differ over a tilted view, so it is fitted to the best displacement of each cell.
         """
         rows, columns = self._valid.shape
         y, x = np.indices((rows, columns))

@@ -44,7 +44,7 @@ MAX_KEYPOINTS = 30_000
 """Maximum number of dense keypoints per image that confirm a homography. Chosen by hand."""
 
 MIN_PARTNERS = 3
-"""To save time, a pair is not registered if other pairs already connect its images and each image
+"""A pair is not registered, to save time, if other pairs already connect its images and each image
 has at least this many registered partners."""
 
 MIN_OVERLAP = 0.1
