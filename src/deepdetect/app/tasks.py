@@ -77,7 +77,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class Task:
-    """A kind of task.
+    """A kind of task that the page offers.
 
     `files` are the smallest and the largest number of images; None stands for the server's limit.
     `packages` are packages that the task needs and that are not installed with DeepDetect.

@@ -42,7 +42,7 @@ OBJECT_STORE_BYTES = 200_000_000
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # avoids a warning
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # avoids a warning by Ray
 }
 
 DATA_SETTINGS = {"enable_progress_bars": False, "print_on_execution_start": False}

@@ -91,7 +91,7 @@ class BatchReport:
     of: str
 
     def check(self) -> None:
-        """Raise a BatchError if something failed."""
+        """Raise a BatchError if an image or a pair failed."""
         if self.failures:
             total = len(self.counts) + self.skipped + len(self.failures)
             raise BatchError(

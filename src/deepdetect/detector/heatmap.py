@@ -22,7 +22,7 @@ from .pretrained import STRIDE
 from .tiling import BYTES_PER_PIXEL, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
-"""Pixels to which the resolution "auto" scales larger images: finer detail is mostly noise."""
+"""The resolution "auto" scales larger images to this many pixels: finer detail is mostly noise."""
 
 RELEASE_PIXELS = 20_000_000
 """If an image with more pixels than this was scaled down for the network, the memory that the

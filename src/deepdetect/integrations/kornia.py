@@ -93,7 +93,7 @@ class DeepDetectFeature(DeepDetectDetector):
         descriptors = [
             unit_length(points.descriptors)
             for points in found
-            if points.descriptors is not None  # always true
+            if points.descriptors is not None  # always true: for the type checker
         ]
         return *self._frames(found, img), padded(descriptors, img.device)
 

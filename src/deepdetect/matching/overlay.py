@@ -168,7 +168,7 @@ def _gradients(gray: np.ndarray) -> np.ndarray:
 
 
 def _same(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return where two images have the same gradients, (H, W) bool."""
+    """Return where two images have the same gradients, (H, W) bool (see `WINDOW_PX`)."""
     one, other = _gradients(first), _gradients(second)
     lengths = [np.linalg.norm(each, axis=2) for each in (one, other)]
     difference, both, common, *squares = (

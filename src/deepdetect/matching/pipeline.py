@@ -193,7 +193,7 @@ def match_features(
     if not 0 < ratio <= 1:
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
     check_memory([len(features0), len(features1)])
-    alike = features0.sizes is None and features1.sizes is None  # all have one scale and angle
+    alike = features0.sizes is None and features1.sizes is None  # keypoints share scale and angle
     nearest = partial(
         match_descriptors,
         matcher=get_matcher(matcher),
@@ -224,7 +224,7 @@ def match_features(
 
 
 def _noted(matches: Matches, left_out: float) -> Matches:
-    """Note the share left out as still; if it exceeds 1/2, "high" confidence becomes "fair"."""
+    """Note the image share left out as still; if above 1/2, "high" confidence becomes "fair"."""
     if (geometry := matches.geometry) is None:
         return matches
     evidence = replace(geometry.evidence, left_out=left_out + geometry.evidence.left_out)

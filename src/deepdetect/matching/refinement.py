@@ -119,7 +119,7 @@ def refine_matches(
 
 
 def _first_affinities(matches: Matches) -> Iterator[np.ndarray]:
-    """Yield (M, 2, 2) initial affine maps: by a homography, or 1; then by sizes and angles."""
+    """Yield (M, 2, 2) initial affine maps: the homography's or identity; by sizes and angles."""
     geometry, count = matches.geometry, len(matches)
     if geometry is not None and geometry.model == "homography" and geometry.matrix is not None:
         yield homography_derivatives(matches.points0, geometry.matrix)

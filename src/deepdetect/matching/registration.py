@@ -180,7 +180,7 @@ def register(
     moved, size = homography @ translation_matrix(left, top), (right - left, bottom - top)
     warped, valid = warp_visible(deep, moved, size)
     (first, empty), hidden = opaque_part(first), opaque_part(deep)[1]
-    if empty is not None:  # the warped image shows through transparent pixels
+    if empty is not None:  # transparent pixels of the first image show the second
         first = np.where((empty & valid)[..., None], to_8_bits(warped), first)
     values = reading.deep_range or (0, 65535)
     warped = from_16_bits(warped, values) if warped.dtype == np.uint16 else warped

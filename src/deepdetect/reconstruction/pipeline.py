@@ -350,7 +350,7 @@ def _calibration(
         return given
     if given is not None:
         names = [str(image) if isinstance(image, (str, Path)) else "" for image in images]
-        left, right = (re.search(r"image_0?(\d)\b", name) for name in names)  # file names of KITTI
+        left, right = (re.search(r"image_0?(\d)\b", name) for name in names)  # KITTI's cameras
         views = (int(left[1]), int(right[1])) if left and right else None
         return Calibration.load(given, *sizes, views=views)
     if focal_px is not None:

@@ -91,7 +91,7 @@ class CameraIntrinsics:
         return cls(camera.model_name, size, tuple(map(float, camera.params)), source)
 
     def colmap_camera(self) -> Any:
-        """Return a `pycolmap.Camera`."""
+        """Return these intrinsics as a `pycolmap.Camera`."""
         pycolmap = import_pycolmap()
         camera = pycolmap.Camera(
             model=self.model, width=self.size[0], height=self.size[1], params=list(self.params)

@@ -182,7 +182,7 @@ def _search(
     size = np.array(own.shape[::-1])
     # Neighbours are warped by the homography of the middle depth. For any other depth, the warped
     # image then only has to be shifted and scaled as a whole.
-    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # [image, first or last, x or y]
+    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # image, first/last, x/y, depth
     for view, places in zip(small[1:], corners, strict=True):
         matrix, vector = relative_projection(small[0], view)
         warp = matrix + middle * np.outer(vector, [0, 0, 1])

@@ -121,7 +121,7 @@ class Georeference:
     heights: str = "unknown"
 
     def summary(self) -> dict[str, Any]:
-        """Return the values as plain Python types for JSON."""
+        """Return the georeference as plain Python types for JSON."""
         if self.origin is None or self.fit is None:
             return {"source": self.source}
         good = np.array([r for name, r in self.residuals.items() if name not in self.wrong])

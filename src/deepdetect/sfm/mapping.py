@@ -68,7 +68,7 @@ USUAL_DISTORTION = 0.05
 distance from the centre. SLRs stay below this, fisheyes of 100 degrees reach 0.14."""
 
 LENSES = {"RADIAL": (0.0, 0.0), "RADIAL_FISHEYE": (1 / 3, 2 / 15)}
-"""Compared camera models: with these coefficients, the series of tan, a fisheye is a pinhole."""
+"""Compared models and initial distortion: by the series of tan, a fisheye starts as a pinhole."""
 
 
 @dataclass(frozen=True, eq=False)

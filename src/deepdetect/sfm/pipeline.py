@@ -124,7 +124,7 @@ def _reconstruct(
     focal_px: float | None,
     control: list[ControlRow] | None,
 ) -> MultiViewReconstruction:
-    """Run the stages, and write all files."""
+    """Run the stages of `reconstruct_many`, and write all files."""
     target, options = stages.output, stages.options
     timer = StageTimer()
     with timer.stage("features"):

@@ -157,7 +157,7 @@ def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
     for _ in range(20):  # bisect the cell size, to a millionth of the extent
         cell = (low + high) / 2
         cells = np.floor((points[order] - points.min(axis=0)) / cell).astype(np.int64)
-        keys = cells @ np.array([1, 2_097_152, 2_097_152**2])  # 21 bits for each axis
+        keys = cells @ np.array([1, 2_097_152, 2_097_152**2])  # a key per cell, 21 bits per axis
         if len(rows := np.unique(keys, return_index=True)[1]) > count:
             low = cell
         else:

@@ -158,7 +158,7 @@ def check_images(
         if not path.is_file():
             raise MissingImageError(f"there is no file {path}: check the path")
         if path.suffix.lower() not in IMAGE_SUFFIXES:
-            load_image(path)  # fails for a video, with advice
+            load_image(path)  # raises an error with advice if it is a video
             raise OptionError(f"{path} does not end in .jpg, .png or another image type: rename it")
     return name_images(paths)
 
@@ -212,7 +212,7 @@ class Stages:
             starts = np.linspace(0, max(0, len(paths) - MIN_VIEWS), COMPARED_RUNS).astype(int)
             for start in sorted({*starts.tolist()}):
                 grays = []
-                with contextlib.suppress(ImageError):  # the extraction reports it
+                with contextlib.suppress(ImageError):  # the extraction reports unreadable images
                     grays = [luma(load_image(path)) for path in paths[start : start + MIN_VIEWS]]
                 if len(grays) == MIN_VIEWS and (mask := find_overlay(grays, self.seed)).any():
                     size = "{1}x{0}".format(*mask.shape)
@@ -253,7 +253,7 @@ class Stages:
                 if name in described:
                     width, height = file[name]["image_size"][()]
                     wide = width >= MIN_ASPECT * height
-                    looked = wide or not sizes  # for a fisheye's circle, until an image has none
+                    looked = wide or not sizes  # look for a fisheye's rim until an image has none
                     try:
                         require_pinhole(path, load_image(path) if looked else None)
                     except ValueError as error:

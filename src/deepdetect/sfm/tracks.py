@@ -135,7 +135,7 @@ class _Tracks:
         self.colors = [np.empty((0, 3), np.uint8)]
         self.count = 0
         none = np.empty(0, np.int64), np.empty((0, 2))
-        self.seen = [[none] for _ in self.images]  # by image: indices of points, pixels
+        self.seen = [[none] for _ in self.images]  # per image: indices of points, their pixels
         largest = max(math.prod(image.intrinsics.size) for image in self.images)
         self.read = lru_cache(max(CACHED_IMAGES, int(CACHED_PIXELS / largest)))(self._read)
 

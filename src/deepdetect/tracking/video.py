@@ -197,7 +197,7 @@ class _SecondReader:
     def check(self, number: int, equal: int, bgr: np.ndarray, *, black: bool = True) -> None:
         """Raise an error if the second reader gives other pixels than `bgr` for frame `number`.
 
-        `equal` is the number of repeats. Unless `black`, black frames, like new memory, also fail.
+        `equal` is the number of repeats. Unless `black`, black frames also fail: new memory is 0.
         """
         for _ in range(self._grabbed, number + 1):
             self._video.grab()

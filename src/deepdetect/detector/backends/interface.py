@@ -18,7 +18,7 @@ PROBE_SHAPE = (24, 32)
 
 
 class Network(Protocol):
-    """A loaded network."""
+    """A network that a backend has loaded, ready to run."""
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Map images, (N, 3, H, W) float32 in [0, 1], to finite logits, (N, 1, H, W) float32.

@@ -61,7 +61,7 @@ class OnnxOptions:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """These options as metadata of the file."""
+        """The entries of the file's metadata that state these options."""
         values = dict(ANY_SIZE)
         if self.size is not None:
             height, width = self.size

@@ -62,7 +62,7 @@ def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
 
 
 def read_metadata(model: ModelProto) -> dict[str, str]:
-    """Return a file's metadata."""
+    """Return the metadata of an ONNX file, by key."""
     return {one.key: one.value for one in model.metadata_props}
 
 

@@ -175,7 +175,7 @@ def rectified_view(
             return None
     starts, ends = (scaled_points(points, scale) for points in sparse)
     searched = _range_of_matches(frame, (starts, ends))
-    if searched[0] >= searched[1]:  # the views show nothing in common
+    if searched[0] >= searched[1]:  # the rectified views do not overlap
         return None
     (first, shown0), (second, shown1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
     disparity, matched, step_px = _match_rows((first, second), searched)
@@ -307,7 +307,7 @@ def _moved_to_lines(
 
 
 def _sample(view: RectifiedView, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices of keypoints that have a disparity, their partners and their scores."""
+    """Return the indices of keypoints with a disparity, their matches' positions, and scores."""
     disparity = view.disparity
     height, width = disparity.shape
     positions = view.to_frame(xy0, 0)
@@ -325,7 +325,7 @@ def _sample(view: RectifiedView, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarra
             weight = np.abs(1 - across - (positions[:, 0] - left)) * np.abs(
                 1 - down - (positions[:, 1] - top)
             )
-            weight *= np.abs(value - nearest) <= 1  # False for NaN
+            weight *= np.abs(value - nearest) <= 1  # 0 where the disparity is NaN
             total += weight * np.nan_to_num(value - nearest)
             weights += weight
     shift = np.column_stack([nearest + total / weights, np.zeros(len(rows))])

@@ -106,7 +106,7 @@ def mean_gradient(gray: np.ndarray) -> np.ndarray:
 
 
 def mean_around(values: np.ndarray) -> np.ndarray:
-    """Average values over three by three windows around each cell; NaN stays NaN."""
+    """Average values of cells over the 12 x 12 cells around each cell; NaN stays NaN."""
     side = 3 * round(WINDOW_CELLS**0.5)
     known = np.isfinite(values)
     total, count = (

@@ -61,10 +61,10 @@ MIN_PERIOD = 3
 """A pattern's period is searched from this many cells (4 px) on: nearer descriptors overlap."""
 
 MIN_SIMILARITY, MAX_COPIES, MIN_OVERLAP = 0.4, 4, 0.5
-"""A displaced copy is compared with a geometry if its correlation over the whole image is at least
-MIN_SIMILARITY times the geometry's, and MIN_OVERLAP of the overlap remains. Copies reach up to 0.3
-of the geometry's on planes of Oxford, 0.6 or more on facades of one repeated window. At most
-MAX_COPIES are compared: a pattern is a lattice, whose points have four nearest neighbours."""
+"""A displaced copy of the warped image, which a pattern may fit, is tested if it correlates over
+MIN_SIMILARITY times as well as the geometry, and MIN_OVERLAP of the overlap remains. The ratio is
+up to 0.3 on planes of Oxford, 0.6 or more on facades of one repeated window. At most MAX_COPIES are
+tested: a pattern is a lattice, whose points have four nearest neighbours."""
 
 MIN_WON, MIN_WON_RATIO = 0.0125, 1.5
 """A geometry must explain at least the fraction MIN_WON of its cells clearly better than each
@@ -145,14 +145,14 @@ class Evidence:
 
     @property
     def agreement(self) -> float:
-        """Fraction of the compared cells with structure that are not contradicted."""
+        """Fraction of cells showing more than noise whose surroundings correlate above chance."""
         compared = self.structured & np.isfinite(self.similarity)
         count = np.count_nonzero(compared)
         return float(np.count_nonzero(compared & ~self.contradicted) / count) if count else 0.0
 
     @property
     def correlation(self) -> float:
-        """Median correlation of the compared cells with structure; 0 without any."""
+        """Median correlation of compared cells that show more than noise; 0 if there are none."""
         compared = self.similarity[self.structured & np.isfinite(self.similarity)]
         return float(np.median(compared)) if len(compared) else 0.0
 
@@ -181,7 +181,7 @@ def contradicts(evidence: Evidence | PublicEvidence) -> bool:
 
 
 class Judge:
-    """Judges geometries of one pair of images."""
+    """Judges geometries of two images by how well their descriptors correlate."""
 
     def __init__(self, pair: ImagePair) -> None:
         (self._first, scale0), (self._second, scale1) = (
@@ -255,7 +255,7 @@ class Judge:
 
 
 class View:
-    """The second image, warped to the frame of the first, compared with it cell by cell."""
+    """The second image, warped to the frame of the first and compared with the first by cells."""
 
     def __init__(
         self,
@@ -284,7 +284,7 @@ class View:
             return Evidence(np.full(self._valid.shape, np.nan), 1.0, 1.0, nowhere, nowhere)
         # The median discards copies that happen to be displaced by the period of a pattern.
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # copies that overlap no cell
+            warnings.simplefilter("ignore", RuntimeWarning)  # from copies that overlap no cell
             bounds = [np.nanquantile(each, 1 - FALSE_POSITIVE_RATE) for each in far]
         bound = float(np.nanmedian(bounds))
         own = self._displaced(0, 0)
@@ -376,7 +376,7 @@ class View:
     def _refined(self, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the homography of a displaced copy near a shift, and each cell's displacement.
 
-        Periods differ over a tilted view, so it is fitted to the best displacement of each cell.
+        As periods differ over a tilted view, the homography is fitted to each cell's best shift.
         """
         rows, columns = self._valid.shape
         y, x = np.indices((rows, columns))

@@ -109,7 +109,7 @@ class Hypothesis:
         return GUIDING_THRESHOLDS_PX[self.model] * self.tentative.pixel
 
     def refitted(self, pair: ImagePair, tracks: Pair) -> Hypothesis:
-        """Return the fundamental matrix fitted also to tracks that agree with it."""
+        """Return this fundamental matrix, fitted also to those of `tracks` that agree with it."""
         near = self.errors(*tracks) < self.threshold_px
         if np.count_nonzero(near) < MIN_MATCHES:
             return self
@@ -117,7 +117,7 @@ class Hypothesis:
         return replace(self, matrix=refine_fundamental(sources, self.matrix, pair.sizes))
 
     def errors(self, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-        """Return the (N,) errors of matches, in pixels."""
+        """Return the (N,) transfer or Sampson errors of matches under the geometry, in pixels."""
         return (transfer_errors if self.model == "homography" else epipolar_errors)(
             points0, points1, self.matrix
         )
@@ -139,7 +139,7 @@ class Sources:
 
     @cached_property
     def learned(self) -> Tentative:
-        """Matches of learned points in copies of the images whose side is `LEARNED_SIDE_PX`."""
+        """Matches of learned points in copies whose longer side is `LEARNED_SIDE_PX`."""
         return self._matched(self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS), LEARNED_SIDE_PX)
 
     def _extract(self, side_px: int, keypoints: int) -> tuple[Keypoints, Keypoints]:

@@ -33,7 +33,7 @@ def census_rows(first, last, padded, out):  # type: ignore[no-untyped-def]
     for y in range(first, last):
         out[y] = 0
         here = padded[y + radius_y, radius_x:]
-        for start in range(0, bits, 8):  # bytes, as a vector register holds more bytes than words
+        for start in range(0, bits, 8):  # in bytes: a vector register holds more bytes than words
             end = min(start + 8, bits)
             part[:] = 0
             for bit in range(start, end):
@@ -82,7 +82,7 @@ def cost_rows(first, last, left, right_mirrored, min_disparity, outside, cost): 
     """
     height, width, count = cost.shape
     line = np.empty((width, count), np.uint8)
-    sums = np.empty((3, width, count), np.uint8)  # of three neighbours in a row: at most 3 x 62
+    sums = np.empty((3, width, count), np.uint8)  # distances of three pixels: at most 3 x 62
     done = first - 2
     for y in range(first, last):
         for row in range(max(y - 1, done + 1), y + 2):
@@ -328,7 +328,7 @@ def step_rows(  # type: ignore[no-untyped-def]
                 spread = vv[x] - v[x] * v[x] / n[x] + floor
                 steep = ss[x] - s[x] * s[x] / n[x] + floor
                 mixed = vs[x] - v[x] * s[x] / n[x]
-                covariance = pv[x] - p[x] * v[x] / n[x] + floor  # a flat window has gain 1
+                covariance = pv[x] - p[x] * v[x] / n[x] + floor  # a flat window gets gain 1
                 moved = ps[x] - p[x] * s[x] / n[x]
                 area = spread * steep - mixed * mixed
                 gain = (covariance * steep - moved * mixed) / area

@@ -92,7 +92,7 @@ def adjust_homographies(
     for _ in range(MAX_ITERATIONS):
         normal, right = _normal_equations(current, links, columns, directions)
         step = np.linalg.lstsq(normal, right, rcond=None)[0]
-        for number, column in columns.items():  # H becomes H (I + E); E[2, 2] is 0
+        for number, column in columns.items():  # H becomes H (I + E); E[2, 2] = 0 fixes the scale
             change = np.append(step[column : column + 8], 0).reshape(3, 3)
             current[number] = _unit_determinant(current[number] @ (np.eye(3) + change))
         if np.abs(step).max(initial=0) < MIN_STEP:

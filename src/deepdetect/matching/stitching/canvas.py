@@ -63,7 +63,7 @@ class Canvas:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """Width and height of the canvas in pixels."""
         _, _, right, bottom = np.max(list(self.boxes.values()), axis=0).tolist()
         return right, bottom
 
@@ -188,7 +188,7 @@ def plan_curved(
     boxes = find_boxes(start)
     top = min(box[1] for box in boxes.values())
     origin = 0 if closed else min(box[0] for box in boxes.values())
-    if closed:  # a box that exceeds one border continues at the other
+    if closed:  # an image cut by one border continues at the other
         wrapped = {}
         for number, (left, up, right, down) in boxes.items():
             wrapped[number] = (max(left, 0), up, min(right, turn), down)

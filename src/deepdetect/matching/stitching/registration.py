@@ -167,7 +167,7 @@ def _adjust(
     sizes: dict[int, tuple[int, int]],
     turning: bool,
 ) -> tuple[dict[int, np.ndarray], dict[int, RotatingCamera] | None, dict[int, np.ndarray], float]:
-    """Fit a group jointly; return homographies, cameras, maps to the common frame, residual."""
+    """Fit images jointly; return homographies, cameras, maps to the common frame, RMS residual."""
     homographies, residual_px = adjust_homographies(_compose(group, pairs), pairs, sizes)
     if not turning:
         return homographies, None, homographies, residual_px
