@@ -49,8 +49,8 @@ window with this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
 """Minimum fraction of keypoints that find a match on their row. If matches must be unique, it is
-MIN_UNIQUE_FRACTION: unrelated photographs had up to 0.005, rectified pairs at least 0.35. Otherwise
-it is MIN_MATCHED_FRACTION: unrelated photographs had up to 0.16, rectified pairs at least 0.64."""
+MIN_UNIQUE_FRACTION: in trials, unrelated photographs had up to 0.005, rectified pairs 0.35 or more.
+Otherwise it is MIN_MATCHED_FRACTION: unrelated ones had up to 0.16, rectified ones 0.64 or more."""
 
 
 @suggest_keywords

@@ -94,7 +94,7 @@ may differ. If only the road fits (street views), agreement reaches 0.74 and cor
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """How well a geometry explains the cells of the first image.
+    """How well a geometry explains the cells (descriptors, 4 px apart) of the first image.
 
     Attributes:
         similarity: (rows, columns) correlation of each cell with its place in the second image;
@@ -113,7 +113,7 @@ class Evidence:
 
     @cached_property
     def explained(self) -> np.ndarray:
-        """(rows, columns) bool, true in the cells that the geometry explains."""
+        """(rows, columns) bool: the cells that correlate above `bound`, as their places agree."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.similarity > self.bound)
 
@@ -138,7 +138,7 @@ class Evidence:
 
     @property
     def windows(self) -> float:
-        """Number of explained cells beyond those that chance explains, in windows of 16 cells."""
+        """Number of explained cells minus those expected by chance, in windows of 16 cells."""
         known = np.isfinite(self.similarity)
         by_chance = FALSE_POSITIVE_RATE * np.count_nonzero(known)
         return float((np.count_nonzero(self.explained) - by_chance) / WINDOW_CELLS)
@@ -169,7 +169,7 @@ class Evidence:
 
     @property
     def share(self) -> float:
-        """Fraction of the compared cells that are explained."""
+        """Fraction of the compared cells that the geometry explains (see `explained`)."""
         known = np.count_nonzero(np.isfinite(self.similarity))
         return float(np.count_nonzero(self.explained) / known) if known else 0.0
 
