@@ -35,7 +35,7 @@ from .pipeline import match_images
 Extent = Literal["reference", "union"]
 
 MAX_UNION = 4
-"""The frame of `extent="union"` has at most this many times the pixels of both. Chosen by hand."""
+"""The frame of `extent="union"` has at most this many times both images' pixels. Set by hand."""
 
 SQUARES = 8
 """Number of the checkerboard's squares along the shorter side. Chosen by hand."""

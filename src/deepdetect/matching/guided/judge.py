@@ -74,7 +74,7 @@ copy leaves 0.012 or less."""
 
 MIN_TIED = 0.5
 """A displaced copy of a geometry is a rival if it explains as well at least this fraction of what
-the geometry explains. A copy that explains only the road of a street is none."""
+the geometry explains. A copy that explains only the road of a street is no rival."""
 
 MIN_STRUCTURE, MIN_GRADIENT = 0.5, 4.0
 """Limits of the mean difference of pixels two apart, in grey levels. Places below MIN_STRUCTURE in
@@ -113,7 +113,7 @@ class Evidence:
 
     @cached_property
     def explained(self) -> np.ndarray:
-        """(rows, columns) bool: the cells that correlate above `bound`, as their places agree."""
+        """(rows, columns) bool: cells that the geometry explains: they correlate above `bound`."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.similarity > self.bound)
 
