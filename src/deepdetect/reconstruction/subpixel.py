@@ -72,7 +72,7 @@ def refine_dense(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of the (N, 2) pixels that are the best corners of about `count` squares."""
+    """Return indices of the (N, 2) pixels that are the best corners of about `count` squares."""
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
     side = np.sqrt(gray.size / count)
