@@ -37,7 +37,7 @@ PARTS_PER_THREAD, TASKS_PER_WORKER = 4, 8
 TASKS_PER_WORKER tasks per worker, so that no thread or worker idles. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""Workers are killed this many seconds after the work fails or is interrupted. Chosen by hand."""
+"""Workers still alive this many seconds after a failure or Ctrl-C are killed. Chosen by hand."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that set the number of threads of libraries when they are loaded."""
@@ -115,7 +115,7 @@ def map_in_processes(
     pending: deque[Future[tuple[Outcome, list[str]]]] = deque()
 
     def submit(most: int) -> None:
-        # The processes start at the first submissions, with Ctrl-C deferred and one thread.
+        # Processes start at the first submissions: deferred Ctrl-C and one thread are inherited.
         with signals_held(), _one_thread_inherited():
             for task in islice(remaining, most):
                 pending.append(pool.submit(_run_task, function, task))
