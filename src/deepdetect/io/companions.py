@@ -25,7 +25,7 @@ def without_masks(paths: Iterable[Path]) -> list[Path]:
     """Return the image files except masks of other images; warn about the masks.
 
     Masks of NAME.jpg are NAME_mask.png, NAME.mask.png, mask_NAME.png and NAME.jpg.png in its
-    folder, and files of these names and NAME.png below a folder `masks`. If there is no NAME.jpg,
+    folder or below a folder `masks`, and NAME.png below a folder `masks`. If there is no NAME.jpg,
     an image with such a name is a mask if it has at most two grey levels.
     """
     paths = [*paths]

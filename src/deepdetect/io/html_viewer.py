@@ -75,7 +75,7 @@ def write_html_page(
         "caption": "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in caption.items()
         ),
-        "cloud": json.dumps(_description(cloud, stored, cameras)),  # has no user text
+        "cloud": json.dumps(_description(cloud, stored, cameras)),  # needs no escaping
         "positions": _base64(stored.levels.astype("<u2")),
         "colors": _base64(stored.colors),
     }

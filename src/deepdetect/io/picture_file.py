@@ -169,7 +169,7 @@ class Metadata:
         height, width = picture.shape[:2]
         fine = self.exif.get_ifd(IFD.Exif)
         size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
-        if size != (width, height):  # the tag holds only for the whole frame
+        if size != (width, height):  # the deleted tag holds only for the whole photograph
             fine.pop(Base.FocalLengthIn35mmFilm, None)
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1
