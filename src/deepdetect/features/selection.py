@@ -237,7 +237,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
     in_bands = list(bands(ranking.shape))
-    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # computed once for both loops
+    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # for both loops below
     lowest = np.float32(-np.inf)
     if count is not None:
         parts = (ranks[wanted(rows) if only is None else only] for rows in in_bands)
@@ -291,7 +291,7 @@ def _is_highest(
     image = np.full(shape, -np.inf, kind)
     image.ravel()[pixels] = np.maximum(scores, np.finfo(kind).min)
     radius = min(radius, max(shape))
-    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # dilation by a square takes linear time
+    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # OpenCV dilates fast by a square
     highest = cv2.dilate(image, window) == image  # outside the border the value is -infinity
     kept = highest.ravel()[pixels]
     rows = np.flatnonzero(kept)
