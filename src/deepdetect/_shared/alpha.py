@@ -47,7 +47,7 @@ def opaque_part(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def continued(pixels: np.ndarray) -> np.ndarray:
-    """Fill transparent pixels with the nearest opaque colour, because a warp mixes neighbours."""
+    """Fill transparent pixels with the nearest opaque colour, since warps mix adjacent pixels."""
     rgb, hidden = opaque_part(pixels)
     if hidden is None:
         return pixels

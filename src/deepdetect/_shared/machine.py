@@ -206,7 +206,7 @@ def use_one_thread() -> None:
 def limited_threads(threads: int | None = None) -> Iterator[None]:
     """Limit how many threads each call in the block uses; None sets no new limit.
 
-    NumPy's matrix products use one thread: more of them spend their time waiting for each other,
+    NumPy's matrix products use one thread: several threads would mostly wait for each other,
     because the matrices are small.
     """
     from threadpoolctl import threadpool_limits

@@ -237,7 +237,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
     in_bands = list(bands(ranking.shape))
-    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # for both loops below
+    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # computed once for both loops
     lowest = np.float32(-np.inf)
     if count is not None:
         parts = (ranks[wanted(rows) if only is None else only] for rows in in_bands)

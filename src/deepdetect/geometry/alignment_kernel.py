@@ -198,7 +198,7 @@ def align(  # type: ignore[no-untyped-def]
             if ts <= 0:
                 break
             gain = ts / tt
-            # Slopes are orthogonal to the template, so `error` depends only on gain times shift.
+            # `slope` is orthogonal to the first patch, so `error` depends only on gain * shift.
             for one in range(free):
                 step[one] = 0
             for one in range(free):

@@ -95,7 +95,7 @@ def _compared(
 def _costs(
     xy: list[np.ndarray], distortion: float, weights: np.ndarray, scales: np.ndarray, flat: bool
 ) -> np.ndarray:
-    """Fit a constraint by reweighted least squares; return (M,) Cauchy costs at `SCALE`."""
+    """Fit x1^T B x0 = 0 (if `flat`, a homography) robustly; return (M,) Cauchy costs at `SCALE`."""
     first, second = (np.column_stack([p, 1 - distortion * (p**2).sum(axis=1)]) for p in xy)
     products = second[:, :, None] * first[:, None, :]
     if flat:  # second is parallel to H first

@@ -24,9 +24,9 @@ BLOCK, MAX_MATCHES = 100_000, 50_000
 fitted to at most MAX_MATCHES, because more do not improve it."""
 
 MAX_ITERATIONS, DERIVATIVE_STEP, MIN_GAIN = 20, 1e-6, 1e-7
-"""Levenberg-Marquardt stops after MAX_ITERATIONS steps, or when the loss falls by less than this
-fraction. Numerical derivatives of the matrix vary each parameter by DERIVATIVE_STEP. Chosen by
-hand."""
+"""Levenberg-Marquardt stops after MAX_ITERATIONS steps, or when one lowers the loss by less than a
+fraction MIN_GAIN. Numerical derivatives of the matrix vary each parameter by DERIVATIVE_STEP.
+Chosen by hand."""
 
 MAX_REFITS, MIN_INLIER_GAIN = 4, 0.01
 """A pose is refitted to its inliers at most MAX_REFITS times, while their number grows by more than

@@ -21,8 +21,8 @@ from ..geometry.camera import PosedView, camera_spacing
 from ..geometry.point_cloud import UNITS, PointCloud, RobustBox, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
-"""The page's field of view is given by the tangent of half its angle: DEFAULT_SLOPE, or a value in
-the range SLOPES. Chosen by hand."""
+"""The page's field of view is given by the tangent of half its angle: a value in the range SLOPES
+that fits the points, or DEFAULT_SLOPE if none has z > 0. Chosen by hand."""
 
 MAX_LEVEL, MARGIN = 65535, 1.0
 """Positions along each axis are stored as integers from 0 to MAX_LEVEL, in 16 bits. Points outside
@@ -75,7 +75,7 @@ def write_html_page(
         "caption": "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in caption.items()
         ),
-        "cloud": json.dumps(_description(cloud, stored, cameras)),  # needs no escaping
+        "cloud": json.dumps(_description(cloud, stored, cameras)),  # no user text to escape
         "positions": _base64(stored.levels.astype("<u2")),
         "colors": _base64(stored.colors),
     }

@@ -28,7 +28,7 @@ SIDE_PX, BLACK, PLAIN, RIM, MAX_DARK, ROUNDNESS, MAX_CUT = 128, 16, 8, 2, 48, (0
 """A round fisheye picture is sought in the image reduced to a shorter side of SIDE_PX. Its pixels
 differ from the corners by over BLACK grey levels. Corners are up to MAX_DARK (noise) or, like all
 pixels over RIM px outside the circle, vary by up to PLAIN. The picture fills ROUNDNESS[0] of a disc
-(octagons: 0.90), or [1] if there are two, and is 1 to MAX_CUT shorter sides wide. Set by hand."""
+(octagons: 0.90), each of two ROUNDNESS[1], and is 1 to MAX_CUT shorter sides wide. Set by hand."""
 
 VIEWS = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90 view.png"
 
