@@ -32,7 +32,7 @@ FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
 A rotation of the image adds the angle times the factor in this array to each number's phase."""
 
 UPRIGHT_DEGREES = 15.0
-"""Smaller rotations between images are not undone: networks have learned to tolerate them."""
+"""Smaller rotations between images are not undone: the trained networks tolerate them."""
 
 TURNED_KEYPOINTS = 512
 """The rotation between two images is estimated by matching this number of the best keypoints of

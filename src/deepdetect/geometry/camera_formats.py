@@ -150,7 +150,7 @@ def objects_in(values: Any, name: str = "") -> Iterator[tuple[str, Values]]:
 
 
 def in_mm(length: float, unit: float | None = None) -> float | None:
-    """Convert a length to mm by `unit` (in mm) or, without it, by size. None if unclear or 0."""
+    """Convert a length to mm by its `unit` in mm, or a guess by its size; None if unclear or 0."""
     if unit is None:
         unit = MM_PER_M if length < METRES_BELOW else float(length >= MM_FROM)
         if not unit:

@@ -44,7 +44,7 @@ def uniform_frame(rgb: np.ndarray) -> np.ndarray:
     if not exact and near.mean() < MIN_NOISY_SHARE:
         return np.zeros(rgb.shape[:2], bool)
     colour = np.median(ring[near], axis=0)
-    with one_opencv_thread():  # or OpenCV starts more threads than OMP_NUM_THREADS allows
+    with one_opencv_thread():  # OpenCV would exceed the number in OMP_NUM_THREADS
         return _frame_of_colour(rgb, colour, exact)
 
 

@@ -22,8 +22,8 @@ distorted model fits better if the mean cost of matches falls by MIN_DEVIATIONS 
 (Vuong's test). At most 4.3 was measured on 201 pairs of pinhole images, and 25 on fisheyes."""
 
 MIN_FLAT_DEVIATIONS, NEAR = 12.0, 3.0
-"""A distorted homography (a plane, or a turned camera) must fit better by MIN_FLAT_DEVIATIONS, also
-if multiplied by the ratio of its inliers (within NEAR times `SCALE`) to those of a pinhole's lines.
+"""A distorted homography (a plane, a turned camera) must fit better by MIN_FLAT_DEVIATIONS, also if
+multiplied by the ratio of its inliers (within NEAR * `SCALE`) to those of a fundamental matrix.
 A bent cloth seen by a pinhole gets 16 * 0.56 = 9, a GoPro 15, a fisheye that turned 44."""
 
 MIN_MATCHES = 30

@@ -24,7 +24,7 @@ BLOCK, MAX_MATCHES = 100_000, 50_000
 fitted to at most MAX_MATCHES, because more do not improve it."""
 
 MAX_ITERATIONS, DERIVATIVE_STEP, MIN_GAIN = 20, 1e-6, 1e-7
-"""Levenberg-Marquardt stops after MAX_ITERATIONS steps, or when one lowers the loss by less than a
+"""Levenberg-Marquardt stops after MAX_ITERATIONS steps, or if one lowers the loss by less than the
 fraction MIN_GAIN. Numerical derivatives of the matrix vary each parameter by DERIVATIVE_STEP.
 Chosen by hand."""
 
