@@ -115,7 +115,7 @@ def map_in_processes(
     pending: deque[Future[tuple[Outcome, list[str]]]] = deque()
 
     def submit(most: int) -> None:
-        # Processes start at the first submissions: deferred Ctrl-C and one thread are inherited.
+        # Processes start at the first submissions, so they inherit deferred Ctrl-C and one thread.
         with signals_held(), _one_thread_inherited():
             for task in islice(remaining, most):
                 pending.append(pool.submit(_run_task, function, task))

@@ -214,7 +214,7 @@ def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -
 
 
 def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions) -> np.ndarray:
-    """Return the pixels that become keypoints, as a bit mask packed like `passing`."""
+    """Return the pixels that become keypoints, as a bit mask packed along the rows."""
     height, width = ranking.shape
     radius = int(options.nms_radius)
     shares = [] if options.density is None else [round(options.density * ranking.size)]

@@ -96,7 +96,7 @@ def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the arguments `taps` and `spans` of `describe_tiles` for keypoints of this size."""
+    """Return pixels' weights in the four bins along an axis, as `describe_tiles` needs them."""
     from .kernels import TAPS_AT_ONCE
 
     width = BIN_WIDTH * size

@@ -129,7 +129,7 @@ def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
 
 
 def matrices(values: Values, name: str, *sizes: int) -> list[np.ndarray]:
-    """Return the two matrices whose keys say left and right, or else a list of the first matrix."""
+    """Return the matrices whose keys say left and right; without such keys, the first matrix."""
     found: dict[str, np.ndarray] = {}
     for key, value in values.items():
         match = re.fullmatch(rf"(left|right|l|r)?({name})(left|right|l|r|[012])?", short(key))

@@ -290,7 +290,7 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def best_of_four(
     essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best pose of an essential matrix: most points lie in front of both cameras."""
+    """Return the one of an essential matrix's four poses with most points before both cameras."""
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
     points0, points1 = _evenly(points0), _evenly(points1)
     poses = [

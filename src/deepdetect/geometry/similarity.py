@@ -52,7 +52,7 @@ class Similarity:
     translation: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Transform (N, 3) points."""
+        """Transform (N, 3) points, to (N, 3) float64."""
         return np.asarray(self.scale * (points @ self.rotation.T) + self.translation)
 
 

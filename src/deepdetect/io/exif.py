@@ -81,7 +81,7 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 
 def read_tags(image: Any) -> tuple[dict[int, Any], dict[str, Any]]:
-    """Return the EXIF tags of a file or PIL image, and its `info` of Pillow with the key "size"."""
+    """Return the EXIF tags of a file or PIL image, and Pillow's `info` of it, with "size" added."""
     try:
         with open_image(image) if is_file(image) else nullcontext(image) as opened:
             exif = opened.getexif()

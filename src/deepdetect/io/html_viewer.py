@@ -146,7 +146,7 @@ def _overview(
     near = cloud.points[inside][:: max(1, int(inside.sum()) // OVERVIEW_POINTS)]
     shown = np.concatenate([near.astype(np.float64), lines])
     (c, s), (d, t) = ((np.cos(angle), np.sin(angle)) for angle in OVERVIEW_RADIANS)
-    axes = np.array([[c, 0, s], [t * s, d, -t * c], [-d * s, t, d * c]])  # as in viewer.html
+    axes = np.array([[c, 0, s], [t * s, d, -t * c], [-d * s, t, d * c]])  # turns as in viewer.html
     seen = shown @ axes.T
     # A point is visible if both |x - x0| and |y - y0| are below slope * (z + distance).
     right, left = ((sign * seen[:, :2] - slope * seen[:, 2:]).max(axis=0) for sign in (1, -1))
