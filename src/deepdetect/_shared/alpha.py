@@ -47,7 +47,7 @@ def opaque_part(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def continued(pixels: np.ndarray) -> np.ndarray:
-    """Fill transparent pixels with the nearest opaque colour; the grey would bleed into warps."""
+    """Fill transparent pixels with the nearest opaque colour, since warps mix adjacent pixels."""
     rgb, hidden = opaque_part(pixels)
     if hidden is None:
         return pixels

@@ -19,13 +19,13 @@ from pathlib import Path
 from .errors import DeepDetectError
 
 ABANDONED_S, STEM_LENGTH = 24 * 3600.0, 40
-"""Temporary files of other machines are removed after ABANDONED_S seconds. Temporary names contain
-up to STEM_LENGTH characters of the final name, since file systems limit names. Chosen by hand."""
+"""Temporary files made by other machines are removed at an age of ABANDONED_S seconds. Temporary
+names contain up to STEM_LENGTH characters of the final name, to stay short. Chosen by hand."""
 
-# The owner in a temporary name is a machine, a process and a random number.
+# This part of a temporary name identifies its writer: machine, process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
 
-# A temporary name has the stem of the final name, the owner, "part" and the final suffix.
+# A temporary name has the stem of the final name, `_OWNER`, "part" and the final suffix.
 _TEMPORARY = re.compile(rf"\..*\.{_OWNER.pattern}\.part(\..*)?")
 
 
@@ -43,7 +43,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         _clear(final.parent.absolute())
         final.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch(exist_ok=False)  # so that no process removes the empty folder
+        temporary.touch(exist_ok=False)  # other processes may remove an empty folder
         yield temporary
         temporary.replace(final)
     except DeepDetectError:  # MissingFileError is also an OSError

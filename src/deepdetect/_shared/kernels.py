@@ -27,7 +27,7 @@ def announce_compilation(tell: Callable[[], object]) -> None:
 
 @functools.cache
 def _listen() -> None:
-    """Call the announcement when numba first compiles a kernel instead of loading a cached one."""
+    """Call `announce_compilation`'s function when numba first compiles a kernel without a cache."""
     from numba.core import event as events
 
     class Listener(events.Listener):

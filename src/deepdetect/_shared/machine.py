@@ -37,7 +37,7 @@ PARTS_PER_THREAD, TASKS_PER_WORKER = 4, 8
 TASKS_PER_WORKER tasks per worker, so that no thread or worker idles. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""Workers are killed this many seconds after the work fails or is interrupted. Chosen by hand."""
+"""Workers still alive this many seconds after a failure or Ctrl-C are killed. Chosen by hand."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that set the number of threads of libraries when they are loaded."""
@@ -56,8 +56,8 @@ BYTES_PER = {
 }
 """Bytes of memory per item, as measured; `needed_memory` multiplies them by numbers of items."""
 
-# Options of glibc's `mallopt`: M_MMAP_MAX 0 maps no block on its own, M_TRIM_THRESHOLD -1 never
-# trims the heap, and M_TOP_PAD lets it grow in steps of 256 MB.
+# Options of glibc's `mallopt` that keep freed memory: M_MMAP_MAX 0 maps no block on its own,
+# M_TRIM_THRESHOLD -1 never trims the heap, and M_TOP_PAD lets it grow in steps of 256 MB.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
 _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD: blocks from 1 MB on are mapped on their own
 
@@ -115,7 +115,7 @@ def map_in_processes(
     pending: deque[Future[tuple[Outcome, list[str]]]] = deque()
 
     def submit(most: int) -> None:
-        # The processes start at the first submissions, with Ctrl-C deferred and one thread.
+        # Processes start at the first submissions, so they inherit deferred Ctrl-C and one thread.
         with signals_held(), _one_thread_inherited():
             for task in islice(remaining, most):
                 pending.append(pool.submit(_run_task, function, task))
@@ -206,7 +206,7 @@ def use_one_thread() -> None:
 def limited_threads(threads: int | None = None) -> Iterator[None]:
     """Limit how many threads each call in the block uses; None sets no new limit.
 
-    NumPy's matrix products use one thread: more of them spend their time waiting for each other,
+    NumPy's matrix products use one thread: several threads would mostly wait for each other,
     because the matrices are small.
     """
     from threadpoolctl import threadpool_limits

@@ -80,7 +80,7 @@ KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable, Mapping: Mappin
 
 @functools.cache
 def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
-    """Return the accepted types of each argument whose annotation consists of simple types."""
+    """Return the accepted types of arguments annotated with `ACCEPTED` types or dataclasses."""
     try:
         hints = typing.get_type_hints(function)
     except NameError:  # a type that only type checkers import
@@ -118,7 +118,7 @@ def whole(name: str, value: Any) -> int:
 
 
 LARGEST = 1e38
-"""`positive` and `not_negative` options may not exceed this, so that they are finite in float32."""
+"""Options that `check_ranges` bounds only from below may not exceed this, to fit into float32."""
 
 
 def check_ranges(

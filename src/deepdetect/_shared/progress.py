@@ -33,7 +33,7 @@ STDERR: Any = _StandardError()
 
 
 def fails(stream: Any) -> bool:
-    """Return whether writing to a stream fails (full disk, broken pipe); if so, send it nowhere."""
+    """Return whether writing to a stream fails (full disk, broken pipe); if so, discard output."""
     if stream is None:
         return False
     try:

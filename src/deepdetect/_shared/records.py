@@ -129,7 +129,7 @@ class Outputs:
     growing: bool = False
 
     def check(self) -> None:
-        """Raise an OptionError if an existing output has no record, or other inputs or settings."""
+        """Raise an OptionError if an output exists, but no record of these inputs and settings."""
         if not self.overwrite:
             for path in self.paths:
                 self._known(path)
@@ -146,7 +146,7 @@ class Outputs:
         for path, record in zip(self.paths, records, strict=True):
             if not record or not record["digest"] or list(file_state(path)) == record["state"]:
                 continue
-            if file_digest(path) != record["digest"]:  # a copy differs only in its time
+            if file_digest(path) != record["digest"]:  # a copied file has another time
                 raise OptionError(f"{path} exists, and was changed after it was made: {ADVICE}")
         states = [list(file_state(path)) for path in self.inputs]
         done = all(record and record["whole"] and record["states"] == states for record in records)
@@ -154,7 +154,7 @@ class Outputs:
 
     @contextmanager
     def writing(self) -> Iterator[dict[str, Any]]:
-        """Write the records before and after the block; yield a dictionary for values to note.
+        """Write the records before and after the block; yield a dictionary that is stored in them.
 
         If the block fails, outputs that it left unchanged get their former records back. If the
         process is killed, the records name the inputs, and mark the outputs as incomplete.
@@ -250,7 +250,7 @@ def was_made(path: Path, root: Path) -> bool:
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Any], *, compress: bool = True) -> None:
     """Write named arrays to an NPZ file, which appears complete or not at all."""
-    # Level 1 leaves 28% of the bytes of dense keypoints, NumPy's level 6 24%, 8 times as slowly.
+    # Level 1 leaves 28% of a file of dense keypoints; NumPy's level 6 leaves 24%, 8 times slower.
     method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
     with (
         atomic_path(path) as temporary,

@@ -26,7 +26,7 @@ def import_onnxruntime() -> ModuleType:
 
 def import_openvino() -> ModuleType:
     """Import OpenVINO as if the optional openvino_telemetry were not installed."""
-    # The variable CI would turn OpenVINO's telemetry off, but also affects other packages.
+    # The environment variable CI would disable telemetry, but also affects other packages.
     return _import_with("openvino", sys.modules, "openvino_telemetry", None)
 
 

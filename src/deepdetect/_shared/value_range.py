@@ -15,9 +15,9 @@ LITTLE_RANGE = 1 / 8
 grey levels are left when it is converted to 8 bits. Chosen by hand."""
 
 MAX_OUTLIERS, FEW = 1e-3, 1e-2
-"""The share MAX_OUTLIERS of the pixels may lie outside the range, as sensors have hot and dead
-pixels. To measure how much of its range an image uses, the share FEW of its pixels is left out at
-either end, because it may show a flame or the sun. Chosen by hand."""
+"""The share of pixels outside the value range may be MAX_OUTLIERS at most, because sensors have
+hot and dead pixels. The warning about LITTLE_RANGE ignores the share FEW of the darkest and of the
+brightest pixels, because a flame or the sun may span most of the range. Chosen by hand."""
 
 ValueRange = tuple[float, float]
 
@@ -57,7 +57,7 @@ def find_range(counts: np.ndarray) -> ValueRange:
     shares = (MAX_OUTLIERS * total[-1], (1 - MAX_OUTLIERS) * total[-1])
     low, high = inner[np.searchsorted(total, shares)].tolist()
     white = _white_above(high)
-    if white < 256 and counts[65535] > shares[0]:  # 65535: lamps in a dark image
+    if white < 256 and counts[65535] > shares[0]:  # not padding: lamps in a dark image
         white = high = 65535
     width = high - low
     if not 0 < width < min(low, LITTLE_RANGE * white):

@@ -15,7 +15,7 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Ratio of a keypoint's diameter to its "scale" in LightGlue, for both meanings of "scale"."""
+"""Ratio of a keypoint's diameter to its "scale" in LightGlue, which is a diameter or a sigma."""
 
 MAX_COORDINATE_BITS = 12
 """`bayer_order` uses at most this many bits of x and y, so that ranks are exact in float32."""
@@ -261,7 +261,7 @@ class Keypoints:
     def distinct(self) -> Keypoints:
         """Keep the best keypoint at each position: SIFT repeats a position for each orientation."""
         order = np.argsort(-self.scores, kind="stable")
-        # Comparing x and y as one number is ten times faster than rows; + 0 turns -0 into 0.
+        # x and y as one 64-bit number sort ten times as fast as rows do; + 0 turns -0 into 0.
         keys = np.ascontiguousarray(self.xy[order] + np.float32(0)).view(np.uint64).ravel()
         _, first = np.unique(keys, return_index=True)
         return self if len(first) == len(self) else self[np.sort(order[first])]

@@ -29,7 +29,7 @@ MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
 
 PRODUCTS = Path(__file__).with_name("products")
 """Folder of ONNX files that multiply two matrices, made by `tools/product_graphs.py`. NumPy takes
-twice the time for a product in single precision, and NumPy's threads stay busy afterwards."""
+twice as long as ONNX Runtime in single precision, and NumPy's threads stay busy afterwards."""
 
 MAX_EXACT_PRODUCT = 4e8
 """Maximum product of the two keypoint counts for which "auto" searches exactly. Chosen by hand."""
@@ -51,12 +51,12 @@ SEARCH_SHRINK = 3
 the longer side of the second image, and is divided by this number after each try."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
-"""Nearest neighbours of N queries: their rows in the base, (N, count) int32, and their distances,
-(N, count) float32, nearest first."""
+"""Nearest neighbours of N descriptors, the queries: row numbers in the searched array, the base,
+(N, count) int32, and distances, (N, count) float32, nearest first."""
 
 Positions = tuple[np.ndarray, np.ndarray] | None
-"""Positions of the queries and of the base in their images, in pixels. None if the keypoints differ
-in scale or angle: nearby keypoints then need not have nearby matches."""
+"""(N, 2) positions of the query keypoints and (M, 2) of those in the base, in pixels. None if the
+keypoints differ in scale or angle: nearby keypoints then need not have nearby matches."""
 
 
 Matcher = Callable[[np.ndarray, np.ndarray, int, int, Positions], Neighbours]
@@ -250,7 +250,7 @@ def patchmatch_neighbours(
 
 
 def _grid(xy: np.ndarray) -> np.ndarray:
-    """Return an image that holds, at each pixel, the row of the position there, or -1."""
+    """Return an image that holds, at each pixel, the row of `xy` with this position, or -1."""
     width, height = xy.max(axis=0) + 1
     grid = np.full((height, width), -1, np.int32)
     grid[xy[:, 1], xy[:, 0]] = np.arange(len(xy))
@@ -319,8 +319,8 @@ def match_descriptors(
     """Match (N, D) with (M, D) descriptors by nearest neighbour and ratio test (Lowe, 2004).
 
     Descriptors are uint8 or float32. Matches are kept if Lowe's ratio is below `ratio`, which is
-    0.99 in the paper's code. `mutual` keeps only mutual nearest neighbours. `seed` and `positions`
-    are passed to the matcher. The matches are ordered by their rows in the first set.
+    0.99 in the DeepDetect paper's code. `mutual` keeps only mutual nearest neighbours. `seed` and
+    `positions` go to the matcher. The matches are ordered by their rows in the first set.
     """
     if len(descriptors0) == 0 or len(descriptors1) < 2:  # there is no second-best neighbour
         none = np.empty(0, np.int32)

@@ -39,11 +39,11 @@ class Evidence:
         simulated_views: number of views that were simulated to find the geometry, as in ASIFT.
         on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
         verified: fraction of the overlap where the images, aligned by the geometry, are more
-            similar than images displaced against each other are at nearly all places.
+            similar than nearly all places of images that are shifted against each other.
         agreement: fraction of the places with structure where images do not contradict the model.
-        correlation: median correlation of the descriptors at places with structure. In a scene with
-            depth, only the surrounding matches, not those at the place itself, predict where the
-            second image shows it. 0 if there are few matches.
+        correlation: median correlation of the descriptors of both images at places with structure.
+            In a scene with depth, the matches around a place predict its position in the second
+            image; the place's own matches are left out. 0 if there are few matches.
         left_out: fraction of the image that was left out, because it stays in place while the scene
             moves: a frame, a caption, a logo, or the vehicle that carries the camera.
     """
@@ -361,7 +361,7 @@ class Matches:
         best_first = np.argsort(-self.scores, kind="stable")
         for side in (0, 1):
             ends = getattr(self, f"indices{side}").astype(np.int64)
-            without = np.flatnonzero(ends < 0)  # numbered by pixel, below 0
+            without = np.flatnonzero(ends < 0)  # ends without a keypoint
             pixels = np.floor(getattr(self, f"points{side}")[without] + np.float32(0.5))
             pixels = np.unique(pixels.astype(np.int64), axis=0, return_inverse=True)[1]
             ends[without] = -1 - pixels.reshape(-1)

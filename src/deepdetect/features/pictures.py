@@ -43,7 +43,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     unit = line_scale(canvas)
     room = int(canvas.shape[0] * canvas.shape[1] / (AREA_OF_KEYPOINT_PX * unit**2))
     most = max(1, min(SHOWN_KEYPOINTS, room, len(keypoints)))
-    # With more cells than drawn keypoints, the parts with the lowest scores would stay empty.
+    # With more grid cells than drawn keypoints, the cells of the lowest scores would be empty.
     shorter, longer = sorted(canvas.shape[:2])
     cells = max(1, int((most * longer / shorter) ** 0.5))
     rows = spread_over_grid(keypoints.xy, values, keypoints.image_size, most, cells)

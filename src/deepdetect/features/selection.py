@@ -214,7 +214,7 @@ def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -
 
 
 def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions) -> np.ndarray:
-    """Return the pixels that become keypoints, as a bit mask packed like `passing`."""
+    """Return the pixels that become keypoints, as a bit mask packed along the rows."""
     height, width = ranking.shape
     radius = int(options.nms_radius)
     shares = [] if options.density is None else [round(options.density * ranking.size)]
@@ -291,7 +291,7 @@ def _is_highest(
     image = np.full(shape, -np.inf, kind)
     image.ravel()[pixels] = np.maximum(scores, np.finfo(kind).min)
     radius = min(radius, max(shape))
-    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # dilation by a square takes linear time
+    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # OpenCV dilates fast by a square
     highest = cv2.dilate(image, window) == image  # outside the border the value is -infinity
     kept = highest.ravel()[pixels]
     rows = np.flatnonzero(kept)

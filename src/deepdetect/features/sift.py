@@ -1,4 +1,4 @@
-"""SIFT descriptors of any keypoints (paper, Section III-C), and well-spread SIFT keypoints.
+"""SIFT and RootSIFT descriptors of any keypoints (DeepDetect paper, Section III-C).
 
 To add a descriptor, add to `DESCRIPTORS` a function `(gray, xy, size, angle) -> (N, D) array`.
 """
@@ -28,7 +28,7 @@ BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""
 
 ROWS_AT_ONCE = 1024
-"""This many descriptors are converted to RootSIFT at a time: they stay in the processor's cache."""
+"""This many descriptors are converted to RootSIFT at a time, to stay in the processor's cache."""
 
 
 def sift_descriptors(
@@ -39,7 +39,7 @@ def sift_descriptors(
     Many upright keypoints on whole pixels are described by `dense_sift`, whose result differs from
     OpenCV's by 1 in one of ten thousand numbers. Other keypoints are described by OpenCV. The size
     is a diameter in pixels, the angle is in degrees. The angle -1 usually means unset, but OpenCV's
-    SIFT reads it as a rotation by one degree, as in the paper's published code.
+    SIFT reads it as a rotation by one degree, as in the DeepDetect paper's code.
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and DENSE_SIZES_PX[0] <= size <= DENSE_SIZES_PX[1]
@@ -96,7 +96,7 @@ def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the arguments `taps` and `spans` of `describe_tiles` for keypoints of this size."""
+    """Return pixels' weights in the four bins along an axis, as `describe_tiles` needs them."""
     from .kernels import TAPS_AT_ONCE
 
     width = BIN_WIDTH * size
@@ -156,7 +156,7 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
 
     Keypoints with sizes are described at their own sizes and angles; unset angles are replaced by
     the dominant gradient orientations. Keypoints without sizes are described upright and with a
-    diameter of 3 pixels, as in the paper.
+    diameter of 3 pixels, as in the DeepDetect paper.
 
     Args:
         gray: (H, W) uint8 luma of the image of the keypoints.

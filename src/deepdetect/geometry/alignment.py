@@ -20,7 +20,7 @@ MIN_CORRELATION = 0.8
 
 RIDGE = 1e-3
 """If affinities are also estimated, this multiple of the mean squared gradient is added to the
-normal equations' diagonal: they are singular for a patch of parallel edges. Chosen by hand."""
+diagonal of the normal equations: a patch of parallel edges makes them singular. Chosen by hand."""
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ def _inverted(matrix, inverse, size):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, fastmath=True)
 def _prepare(image, x0, y0, weight, radius, free, ridge, cubic, ring, template, slope, inverse):  # type: ignore[no-untyped-def]
-    """Write a patch without its mean, its derivatives, and the inverse of their normal matrix.
+    """Write a patch's derivatives, the inverse of their normal matrix, and the patch less its mean.
 
     Returns the variance of the patch; 0 if the patch is flat or shows only parallel edges.
     """
@@ -198,7 +198,7 @@ def align(  # type: ignore[no-untyped-def]
             if ts <= 0:
                 break
             gain = ts / tt
-            # Slopes are orthogonal to the template, so `error` depends only on gain times shift.
+            # `slope` is orthogonal to the first patch, so `error` depends only on gain * shift.
             for one in range(free):
                 step[one] = 0
             for one in range(free):

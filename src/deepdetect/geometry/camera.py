@@ -34,7 +34,7 @@ from .transforms import outer_corners
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
-"""A `disparity_offset_px` off by more from cx right - cx left is an error. Chosen by hand."""
+"""Maximum difference of `disparity_offset_px` from cx right - cx left, in px. Chosen by hand."""
 
 
 @suggest_keywords

@@ -50,7 +50,7 @@ SIZES = (
     *(("width", "height"), ("w", "h"), ("cols", "rows"), ("imagewidth", "imageheight")),
     *(("resolution",), ("imagedimension",)),
 )
-"""Names of matrices, focal lengths, principal points and image sizes in files, made `short`."""
+"""Names of matrices, focal lengths, principal points and image sizes, as `short` returns them."""
 SIZE_NAMES = {name for names in SIZES for name in names}
 
 MODELS = re.compile(r"(distortion)?(model|type)|modeltype|projection(type)?|poly.*name")
@@ -69,7 +69,7 @@ CROPS = re.compile(r"[xy]_offset|binning_[xy]")
 BASELINES = re.compile(
     r"(?:stereo)?baseline(?:in)?(?:(mm|millimet\w+)|(cm|centimet\w+)|(m|met\w+))?"
 )
-"""Names of distortion coefficients, sensor crops, and baselines in mm, cm, m or without a unit."""
+"""Patterns of names of distortion coefficients, sensor crops and baselines (with their units)."""
 
 ZED_SIZES = {
     **{"2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200)},
@@ -129,7 +129,7 @@ def matrix_of(value: Any, *sizes: int) -> np.ndarray | None:
 
 
 def matrices(values: Values, name: str, *sizes: int) -> list[np.ndarray]:
-    """Return the two matrices whose keys say left and right, or else a list of the first matrix."""
+    """Return the matrices whose keys say left and right; without such keys, the first matrix."""
     found: dict[str, np.ndarray] = {}
     for key, value in values.items():
         match = re.fullmatch(rf"(left|right|l|r)?({name})(left|right|l|r|[012])?", short(key))
@@ -150,7 +150,7 @@ def objects_in(values: Any, name: str = "") -> Iterator[tuple[str, Values]]:
 
 
 def in_mm(length: float, unit: float | None = None) -> float | None:
-    """Convert a length to mm by `unit` (in mm) or, without it, by size. None if unclear or 0."""
+    """Convert a length to mm by its `unit` in mm, or a guess by its size; None if unclear or 0."""
     if unit is None:
         unit = MM_PER_M if length < METRES_BELOW else float(length >= MM_FROM)
         if not unit:
@@ -211,7 +211,7 @@ def check_whole(values: Values) -> None:
 
 
 def _pair_at(values: Values, choices: Iterable[tuple[str, ...]]) -> list[float]:
-    """Return the values of the first pair of keys that `values` has, a single one twice, or []."""
+    """Return two values, of the first keys in `choices` that exist (a single one twice), or []."""
     for names in choices:
         if numbers := [n for name in names for n in numbers_in(values.get(name))]:
             if len(numbers) < len(names):
@@ -245,7 +245,7 @@ def _of_matrix(matrix: np.ndarray, first: Any) -> tuple[list[float], list[float]
 
 
 def view_of(values: Values, image: Pair, form: Format) -> dict[str, Any] | None:
-    """Convert an object with the usual names to one view, with the keys of calib.json.
+    """Convert an object with names such as fx and cx, or K, to a view with calib.json's keys.
 
     If the object describes no camera, None is returned.
     """

@@ -147,7 +147,7 @@ class PolarFrame:
         first = np.column_stack([np.cos(angles), np.sin(angles)])
         if not view:
             return first
-        # All points in a direction share the epipolar line of its point at infinity.
+        # A direction from the first epipole has one epipolar line: that of its point at infinity.
         lines = first @ self.fundamental[:, :2].T
         along = self.orientation * np.column_stack([lines[:, 1], -lines[:, 0]])
         return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)

@@ -31,12 +31,12 @@ MAX_LOG10_NFA = -6.0
 """A geometry is trusted if log10 of its number of false alarms is below this. Chosen by hand."""
 
 NEARBY_AREA = 16.0
-"""A match is near a model if it lies in the inlier region enlarged to this multiple of its area."""
+"""A match is near a model if it lies in the inlier region enlarged to this multiple of its area. In
+157 pairs of images of two sensors, `log10_nfa_nearby` reduced wrong answers from 16 to 2."""
 
 MAX_ORDERS = 100
-"""A fit tries at most this number of random orders of the matches, until OpenCV raises no error.
-OpenCV 5.0 raised one for 20 of 1,600 sets of 15 to 25 matches in a small region, and for the worst
-of these sets in 89 of 100 orders."""
+"""A fit tries at most this number of random orders of the matches until OpenCV raises no error. For
+the worst of 1,600 sets of 15 to 25 nearby matches, OpenCV 5.0 raised one in 89 of 100 orders."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Number of matches that the minimal solver of each model needs."""

@@ -118,8 +118,8 @@ def local_zncc(
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation (ZNCC) of windows at the same positions.
 
-    A window of side `window_px`, an odd multiple of `step_px`, is centred on each square of
-    `step_px` pixels. Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for windows that
+    A window of side `window_px`, an odd multiple of `step_px`, is centred on each square of side
+    `step_px`. Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for windows that
     are flat (up to `min_variance`) or partly outside `valid_mask`.
     """
     side = window_px // step_px

@@ -21,8 +21,8 @@ MIN_MATCHES = 6
 """Five matches determine a pose; only from a sixth on do they constrain the cameras."""
 
 START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
-"""Focal lengths in units of the image's longer side. The refinement starts from the one that makes
-the matrix most nearly essential. Chosen by hand."""
+"""Focal lengths in units of the image's longer side. The refinement starts from the one that brings
+the fundamental matrix closest to an essential matrix. Chosen by hand."""
 
 FOCAL_SPREAD, FOCAL_DIFFERENCE, PRINCIPAL_POINT_SPREAD = 0.7, 0.03, 0.03
 """Prior standard deviations, in units of the image's longer side: of the mean log focal length from
@@ -66,7 +66,7 @@ def refine_fundamental(
 
 
 def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Cameras:
-    """Return the cameras whose focal length makes the matrix most nearly an essential matrix."""
+    """Return the cameras whose focal length brings `fundamental` closest to an essential matrix."""
 
     def likeness(cameras: _Cameras) -> float:
         largest, middle, _ = np.linalg.svd(cameras.essential(fundamental), compute_uv=False)

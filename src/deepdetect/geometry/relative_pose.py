@@ -24,9 +24,9 @@ BLOCK, MAX_MATCHES = 100_000, 50_000
 fitted to at most MAX_MATCHES, because more do not improve it."""
 
 MAX_ITERATIONS, DERIVATIVE_STEP, MIN_GAIN = 20, 1e-6, 1e-7
-"""Levenberg-Marquardt stops after MAX_ITERATIONS steps, or when the loss falls by less than this
-fraction. Numerical derivatives of the matrix vary each parameter by DERIVATIVE_STEP. Chosen by
-hand."""
+"""Levenberg-Marquardt stops after MAX_ITERATIONS steps, or if one lowers the loss by less than the
+fraction MIN_GAIN. Numerical derivatives of the matrix vary each parameter by DERIVATIVE_STEP.
+Chosen by hand."""
 
 MAX_REFITS, MIN_INLIER_GAIN = 4, 0.01
 """A pose is refitted to its inliers at most MAX_REFITS times, while their number grows by more than
@@ -129,7 +129,7 @@ class RelativePose:
         inliers: (M,) bool, True for matches with an error below the threshold.
         errors: (M,) float64 Sampson distances of all matches in pixels.
         cheirality_ratio: fraction of the inliers that lie in front of both cameras, in [0, 1].
-        left_out: fraction of the image that `estimate_pose` ignored, as it stands still (overlays).
+        left_out: fraction of the image that `estimate_pose` ignored: overlays that stand still.
     """
 
     rotation: np.ndarray
@@ -202,7 +202,7 @@ def refine_pose(
     """Refine a pose by the Sampson distances of (M, 2) matches, most of them correct.
 
     A Cauchy loss is minimised over five angles: three of the rotation and two of the direction of
-    the translation. It is never higher than that of the initial pose. A match with a Sampson
+    the translation. The loss never rises above that of the initial pose. A match with a Sampson
     distance of `scale_px` / 2 has half the weight of an exact match.
     """
     points0, points1 = _evenly(points0), _evenly(points1)
@@ -228,11 +228,11 @@ def fit_to_lines(
     axes: np.ndarray,
     prior: Callable[[T], np.ndarray] = lambda _: np.empty(0),
 ) -> T:
-    """Fit what determines a fundamental matrix to (M, 2) matches, with a Cauchy loss.
+    """Fit the parameters of a fundamental matrix, such as a pose, to (M, 2) matches (Cauchy loss).
 
-    Levenberg-Marquardt begins at `start`. `moved` changes its parameters by a vector, and the rows
-    of `axes` are the unit vectors. Match errors and deviations from the `prior` are divided by
-    their standard deviations.
+    Levenberg-Marquardt begins at `start`. `moved` adds a vector to the parameters, and the rows of
+    `axes` are its unit vectors. `matrix_of` computes the matrix. Errors of matches are divided by
+    `sigmas`, (M,) in pixels; `prior` returns deviations in units of their standard deviations.
     """
     count, damping = len(points0), 1e-3
 
@@ -290,7 +290,7 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def best_of_four(
     essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best pose of an essential matrix: most points lie in front of both cameras."""
+    """Return the one of an essential matrix's four poses with most points before both cameras."""
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
     points0, points1 = _evenly(points0), _evenly(points1)
     poses = [

@@ -52,7 +52,7 @@ class Similarity:
     translation: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Transform (N, 3) points."""
+        """Transform (N, 3) points, to (N, 3) float64."""
         return np.asarray(self.scale * (points @ self.rotation.T) + self.translation)
 
 
@@ -66,7 +66,7 @@ class SimilarityFit:
         wrong: (N,) bool, True for points that do not agree with the others.
         scale_std: relative standard deviation of the scale; 0 if the scale was given.
         axes_std_deg: (3,) standard deviations of the rotation about the targets' axes, in degrees.
-        axis_std_deg_of_targets: the one about the least certain axis, without `level`, up to 180.
+        axis_std_deg_of_targets: largest standard deviation about an axis, without `level`, degrees.
     """
 
     similarity: Similarity

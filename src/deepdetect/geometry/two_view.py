@@ -23,7 +23,7 @@ recognised. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip.""
 
 MAX_MEDIAN_MOTION_PX, MAX_MOTION_PX, MOTION_QUANTILE = 0.5, 3.0, 0.9
 """Two images show the same view only if the median motion of matches is below MAX_MEDIAN_MOTION_PX,
-and their MOTION_QUANTILE below MAX_MOTION_PX. Chosen like `SCENE_THRESHOLDS_PX`."""
+and the quantile MOTION_QUANTILE below MAX_MOTION_PX. Chosen like `SCENE_THRESHOLDS_PX`."""
 
 
 def fit_model(

@@ -16,7 +16,7 @@ MASK_WORD = re.compile(r"^masks?([ ._-]+|$)|[ ._-]+masks?(?=[ ._-]|$)", re.IGNOR
 
 def holds_image(path: Path) -> bool:
     """Return whether a file of any suffix begins like an image that can be opened."""
-    with suppress(Exception), path.open("rb") as file:  # Pillow's readers raise many kinds
+    with suppress(Exception), path.open("rb") as file:  # Pillow's readers raise many errors
         return identify(file, "", [key for key in FORMATS if key != "TGA"]) is not None
     return False
 
@@ -25,7 +25,7 @@ def without_masks(paths: Iterable[Path]) -> list[Path]:
     """Return the image files except masks of other images; warn about the masks.
 
     Masks of NAME.jpg are NAME_mask.png, NAME.mask.png, mask_NAME.png and NAME.jpg.png in its
-    folder, and files of these names and NAME.png below a folder `masks`. If there is no NAME.jpg,
+    folder or below a folder `masks`, and NAME.png below a folder `masks`. If there is no NAME.jpg,
     an image with such a name is a mask if it has at most two grey levels.
     """
     paths = [*paths]
@@ -60,6 +60,6 @@ def _has_two_levels(path: Path) -> bool:
 def tell_left_out(paths: Sequence[Path], what: str) -> None:
     """Warn that the files `paths` are left out; `what` says what they are, in the plural."""
     if paths:
-        first = Path(*paths[0].parts[-2:])  # absolute paths give the same text
+        first = Path(*paths[0].parts[-2:])  # the same for relative and absolute paths
         text = f"{len(paths)} {what} are left out, such as {first} (rename them to use them)"
         warnings.warn(text, UserWarning, stacklevel=4)

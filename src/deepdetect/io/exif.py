@@ -48,7 +48,7 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
     """
     name = file_name(image)
     tags, notes = read_tags(image)
-    # The HEIF plug-in turns images upright and resets the usual tag; PIL images are not turned.
+    # Pillow's HEIF plug-in turns images upright and resets the tag. We turn files, not PIL images.
     orientation = notes.get("original_orientation") or tags.get(Base.Orientation, 1)
     turned = is_file(image) and orientation in TRANSPOSED
     own = (size[1], size[0]) if turned else size
@@ -70,7 +70,7 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
 
 
 def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None:
-    """Return (fx, fy) in pixels from the sensor resolution, times `scale`, or None without tags."""
+    """Return (fx, fy) in px from FocalLength and the sensor resolution, times `scale`, or None."""
     length = _number(tags.get(Base.FocalLength))
     unit = MM_PER_UNIT.get(int(_number(tags.get(Base.FocalPlaneResolutionUnit))) or 2, 0.0)
     across = _number(tags.get(Base.FocalPlaneXResolution))
@@ -81,7 +81,7 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 
 def read_tags(image: Any) -> tuple[dict[int, Any], dict[str, Any]]:
-    """Return the EXIF tags of a file or PIL image, and its `info` of Pillow with the key "size"."""
+    """Return the EXIF tags of a file or PIL image, and Pillow's `info` of it, with "size" added."""
     try:
         with open_image(image) if is_file(image) else nullcontext(image) as opened:
             exif = opened.getexif()

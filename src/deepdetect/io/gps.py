@@ -67,7 +67,7 @@ def read_gps(path: Path) -> GpsFix | None:
     latitude = _degrees(tags.get(GPS.GPSLatitude), north_south == "S")
     longitude = _degrees(tags.get(GPS.GPSLongitude), east_west == "W")
     assumed = north_south not in ("N", "S") or east_west not in ("E", "W")
-    # 0 and 1: above and below sea level, or since EXIF 3.0 the ellipsoid (2 and 3: sea level).
+    # 0: above, 1: below sea level or, since EXIF 3.0, the ellipsoid. 2: above, 3: below sea level.
     reference = tags.get(GPS.GPSAltitudeRef, 0)
     reference = reference[0] if isinstance(reference, bytes) else reference
     altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if reference in (1, 3) else 1)
@@ -105,7 +105,7 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 
 def _degrees(value: Any, below: bool) -> float:
-    """Convert degrees, minutes, seconds to degrees: negative if `below` 0, NaN if invalid."""
+    """Convert degrees, minutes, seconds to degrees: negative if `below` (S, W), NaN if invalid."""
     degrees, minutes, seconds = [*map(_number, np.ravel(value)), 0.0, 0.0][:3]
     sum_ = degrees + minutes / 60 + (seconds if np.isfinite(seconds) else 0) / 3600
     return -sum_ if below else sum_

@@ -21,8 +21,8 @@ from ..geometry.camera import PosedView, camera_spacing
 from ..geometry.point_cloud import UNITS, PointCloud, RobustBox, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
-"""The page's field of view is given by the tangent of half its angle: DEFAULT_SLOPE, or a value in
-the range SLOPES. Chosen by hand."""
+"""The page's field of view is given by the tangent of half its angle: a value in the range SLOPES
+that fits the points, or DEFAULT_SLOPE if none has z > 0. Chosen by hand."""
 
 MAX_LEVEL, MARGIN = 65535, 1.0
 """Positions along each axis are stored as integers from 0 to MAX_LEVEL, in 16 bits. Points outside
@@ -75,7 +75,7 @@ def write_html_page(
         "caption": "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in caption.items()
         ),
-        "cloud": json.dumps(_description(cloud, stored, cameras)),  # has no user text
+        "cloud": json.dumps(_description(cloud, stored, cameras)),  # no user text to escape
         "positions": _base64(stored.levels.astype("<u2")),
         "colors": _base64(stored.colors),
     }
@@ -146,7 +146,7 @@ def _overview(
     near = cloud.points[inside][:: max(1, int(inside.sum()) // OVERVIEW_POINTS)]
     shown = np.concatenate([near.astype(np.float64), lines])
     (c, s), (d, t) = ((np.cos(angle), np.sin(angle)) for angle in OVERVIEW_RADIANS)
-    axes = np.array([[c, 0, s], [t * s, d, -t * c], [-d * s, t, d * c]])  # as in viewer.html
+    axes = np.array([[c, 0, s], [t * s, d, -t * c], [-d * s, t, d * c]])  # turns as in viewer.html
     seen = shown @ axes.T
     # A point is visible if both |x - x0| and |y - y0| are below slope * (z + distance).
     right, left = ((sign * seen[:, :2] - slope * seen[:, 2:]).max(axis=0) for sign in (1, -1))

@@ -59,7 +59,7 @@ GREY_PNG = 0
 """Colour type of a grey PNG image: the value at offset 25 of the file."""
 
 STRIP_PIXELS = 1 << 20
-"""PIL images are converted in strips of this size: a copy of a large image takes gigabytes."""
+"""PIL images are converted in strips of this many pixels: a whole copy could take gigabytes."""
 
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda image: cv2.flip(image, 1),
@@ -175,9 +175,9 @@ def load_pair(
 def one_range(images: Any, channels: Channels = "rgb") -> Iterator[ReadingOptions]:
     """Read all uint16 images in the block with one value range; yield the reading options.
 
-    Every function that reads several images does so in such a block. The range is found from all
-    `images` that may have 16 bits, or from `SEEN_IMAGES` at equal steps; not if the first of them
-    has 8 bits or states its range. Open files and pipes, perhaps readable only once, are skipped.
+    Every function that reads several images does so in such a block. The range is found from up to
+    `SEEN_IMAGES` evenly chosen `images` that may have 16 bits. None is sought if the first of them
+    has 8 bits or states its range. Open files and pipes are skipped: some are readable only once.
     """
     options, counts = reading_options(), np.zeros(1 << 16, np.int64)
     seen = [each for each in images if _may_be_deep(each)] if options.deep_range is None else []
@@ -210,7 +210,7 @@ def _stated_bits(start: bytes | bytearray) -> int:
         return int.from_bytes(start[24:25])
     if start[:4] == b"\xffO\xffQ" or header > 0:
         bits = 1 + int.from_bytes(start[42:43] if header < 0 else start[header + 14 : header + 15])
-        return bits if bits <= 16 else 0  # signed or of several depths
+        return bits if bits <= 16 else 0  # above 16: signed, or bands of several depths
     return 0
 
 
@@ -390,7 +390,7 @@ def _behind_mask(rgb: np.ndarray, name: str) -> np.ndarray:
 def _by_opencv(
     file: BinaryIO, name: str, options: ReadingOptions, deep: bool, raw: bool
 ) -> np.ndarray:
-    """Read a PNG or JPEG 2000 file with 9 to 16 bits, which Pillow would reduce or scale."""
+    """Read a PNG or JPEG 2000 file with 9 to 16 bits, whose values Pillow would change."""
     file.seek(0)
     values = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:

@@ -157,7 +157,7 @@ class ReadingOptions:
         return {name: value for name, value in values.items() if value not in (None, False)}
 
     def check_size(self, name: str, size: tuple[int, int]) -> None:
-        """Raise an ImageError if an image has too many pixels."""
+        """Raise an ImageError if an image of this (width, height) exceeds `max_megapixels`."""
         width, height = size
         if width * height > 1e6 * self.max_megapixels:
             raise ImageError(

@@ -14,8 +14,8 @@ from .image import UPRIGHT, orientation_of
 from .image_file import open_image
 
 WHITES = (1, 255, 65535)
-"""White is one of these values, but the file does not tell which: a mask of 1, 8 or 16 bits may be
-stored in a file with more bits."""
+"""White in a mask file is one of these values. The file does not tell which, because a mask of 1, 8
+or 16 bits may be stored in a file with more bits."""
 
 
 def save_mask(mask: np.ndarray, path: str | Path) -> None:

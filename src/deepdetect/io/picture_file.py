@@ -121,7 +121,7 @@ class Metadata:
         return filled, self
 
     def moved(self, matrix: np.ndarray | None) -> Metadata:
-        """Return the metadata after a warp by an affine (3, 3) matrix; None: an unknown warp."""
+        """Return the metadata after a warp by an affine (3, 3) matrix; None: no georeference."""
         if self.to_world is None or matrix is None:
             return replace(self, to_world=None, crs=None)
         return replace(self, to_world=self.to_world @ np.linalg.inv(matrix / matrix[2, 2]))
@@ -169,7 +169,7 @@ class Metadata:
         height, width = picture.shape[:2]
         fine = self.exif.get_ifd(IFD.Exif)
         size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
-        if size != (width, height):  # the tag holds only for the whole frame
+        if size != (width, height):  # the deleted tag holds only for the whole photograph
             fine.pop(Base.FocalLengthIn35mmFilm, None)
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1
@@ -317,7 +317,7 @@ def _stored_pixels(orientation: int, width: int, height: int) -> np.ndarray:
 
 @contextmanager
 def _rasterio() -> Iterator[Any]:
-    """Yield rasterio; masks go into files, and a missing georeference gives no warning."""
+    """Yield rasterio, which writes masks into the TIFF; a missing georeference gives no warning."""
     import rasterio
 
     with warnings.catch_warnings(), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
@@ -339,7 +339,7 @@ def _kept_exif(exif: Any) -> Any:
         del kept[Base.ImageDescription]
     for code in set(EXIF_DIRECTORIES).intersection(exif):
         kept.get_ifd(code).update(exif.get_ifd(code))
-        kept[code] = 0  # placeholder; writing sets the pointer
+        kept[code] = 0  # placeholder for the pointer, which is set when writing
     return kept
 
 

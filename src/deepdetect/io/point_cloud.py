@@ -61,7 +61,7 @@ def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | N
     """Write a point cloud to a file atomically.
 
     Args:
-        cloud: the cloud.
+        cloud: at least one point, with colours.
         path: its suffix chooses the format:
             .ply: binary PLY, in the cloud's own frame and unit;
             .glb: binary glTF 2.0, y up and in metres;

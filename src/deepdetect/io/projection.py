@@ -19,16 +19,16 @@ MIN_ASPECT, MAX_ASPECT = 1.95, 2.05
 equirectangular (2:1, with a margin for resizing); a wider one may be cylindrical."""
 
 ROWS, DETAIL, FAR, MARGIN = 256, 31, 16, 1.3
-"""Left and right edge of a panorama meet: they differ MARGIN times less than either edge does from
-columns 1 / FAR of the width away, and than mirrored columns do. ROWS rows are compared, minus the
-mean of DETAIL rows. Chosen on 50 panoramas of rendered rooms; of 60 others, 1.1 % are missed (JPEG
-quality 30: none). One of 3,222 photographs cut to 2:1 or wider is refused (a mirrored banner)."""
+"""A panorama's first and last column differ MARGIN times less than either differs from any column
+1 / FAR of the width or more away, and than columns mirrored at the middle differ. ROWS rows are
+compared, minus the mean of DETAIL rows. Chosen on 50 panoramas of rendered rooms. One of
+3,222 photographs cut to 2:1 or wider is mistaken for a panorama: a mirrored banner."""
 
 SIDE_PX, BLACK, PLAIN, RIM, MAX_DARK, ROUNDNESS, MAX_CUT = 128, 16, 8, 2, 48, (0.97, 0.92), 16 / 9
-"""A fisheye circle differs from the image corners by over BLACK grey levels, after the shorter side
-was reduced to SIDE_PX. Corners are dark, up to MAX_DARK (noise), or they and all pixels over RIM px
-outside the circle vary by up to PLAIN. The circle fills ROUNDNESS[0] of a disc (an octagon: 0.90),
-of two side by side ROUNDNESS[1], and is 1 to MAX_CUT shorter sides wide. Chosen by hand."""
+"""A round fisheye picture is sought in the image reduced to a shorter side of SIDE_PX. Its pixels
+differ from the corners by over BLACK grey levels. Corners are up to MAX_DARK (noise) or, like all
+pixels over RIM px outside the circle, vary by up to PLAIN. The picture fills ROUNDNESS[0] of a disc
+(octagons: 0.90), each of two ROUNDNESS[1], and is 1 to MAX_CUT shorter sides wide. Set by hand."""
 
 VIEWS = "cut it into pinhole views: ffmpeg -i {} -vf v360={}:h_fov=90:v_fov=90 view.png"
 
@@ -39,8 +39,8 @@ def require_pinhole(
     """Raise an ImageError if an image is a panorama or a fisheye picture.
 
     `rgb` (H, W, 3) are its pixels; if None, only its metadata are examined. If `rim`, a round
-    picture on plain ground counts as a fisheye picture, although a plane in an eyepiece looks
-    the same. The message calls an image that is not a file `name`.
+    picture on plain ground counts as a fisheye picture, although a photograph through an eyepiece
+    looks the same. The message calls an image that is not a file `name`.
     """
     raw = file_name(image).lower().endswith(RAW_SUFFIXES)
     tags, notes = ({}, {}) if raw else read_tags(image)
@@ -78,7 +78,7 @@ def edges_meet(gray: np.ndarray) -> bool:
     few, size = gray[:: max(1, height // (2 * ROWS))], (min(2 * ROWS, width), min(ROWS, height))
     values = cv2.resize(few, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     values -= cv2.blur(values, (1, DETAIL))
-    values = np.sign(values) * np.sqrt(np.abs(values))  # so that no single edge decides
+    values = np.sign(values) * np.sqrt(np.abs(values))  # limits the weight of strong contrasts
     values /= np.sqrt((values**2).sum(axis=0) + len(values) / 12)  # 1/12: variance of rounding
     far = size[0] // FAR
     mirrored = (values * values[:, ::-1]).sum(axis=0)[far // 2 : (size[0] - far) // 2]

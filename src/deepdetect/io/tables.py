@@ -35,7 +35,7 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
     """Write keypoints to a file atomically.
 
     Args:
-        keypoints: the keypoints.
+        keypoints: keypoints of one image.
         path: ending in .npz or .csv. An npz file has the arrays `keypoints` (N, 2) float32,
             `scores` (N,) float32, `image_size` (width, height), and, if known, `logits`, `sizes`
             and `angles` (N,) float32, `descriptors` (N, D) and `descriptor_type`. A CSV file has
@@ -82,7 +82,7 @@ def save_matches(matches: Matches, path: str | Path) -> None:
     """Write matches to a file atomically.
 
     Args:
-        matches: the matches.
+        matches: matches of two images, with their keypoints.
         path: ending in .npz or .csv. An npz file has the attributes of `Matches`: `points0` and
             `points1` (M, 2) float32, `indices0` and `indices1` (M,) int32 (the rows of the matched
             keypoints in `keypoints0` and `keypoints1`), `scores` (M,) float32, `inliers` (M,) bool,

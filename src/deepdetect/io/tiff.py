@@ -31,7 +31,7 @@ JPEG = (6, 7)
 """Codes of JPEG compression, the only compression with which YCbCr is read."""
 
 ALPHA = (1, 2)
-"""Types of extra samples that are alpha, not a band; with type 1, it has multiplied the colours."""
+"""Codes of extra samples that are alpha. If it is 1, colours are already multiplied by alpha."""
 ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of TIFF tags. NO_DATA is defined by GDAL."""
 
@@ -82,8 +82,8 @@ def read_tiff(
                 raise damaged_image(name, error) from None
             bands, orientation = _decoded_by_pillow(file, stored, page, name), 1
         else:
-            # tifffile's axes are bands stored as planes, depth, height, width, bands stored per
-            # pixel. One of the two axes for bands has length 1. The result is (H, W, bands).
+            # tifffile's axes: (bands stored as planes, depth, height, width, bands stored per
+            # pixel). One of the two axes for bands has length 1. The result is (H, W, bands).
             bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
         if raw and photometric in (MIN_IS_BLACK, RGB):
             return bands, orientation
@@ -125,7 +125,7 @@ def page_numbers(source: Any, frames: bool = False) -> list[int]:
     """Return the numbers, from 0, of the images in a file: values of `page` in `load_image`.
 
     Images at most half as wide or high as the largest do not count: previews, gain maps, and the
-    levels of a pyramid. With `frames` (of a video), channels, or slices of frames, are errors.
+    levels of a pyramid. With `frames` (of a video), a stack of channels or slices is an error.
     """
     from tifffile import TiffFile
 
@@ -176,7 +176,7 @@ def _to_pixels(
     chosen = _chosen_bands(bands, page, name, options)
     value = no_data_of(page)
     each = np.isnan(chosen) | (chosen == (np.nan if value is None else value))
-    absent = each.all(axis=2)  # like GDAL: 0 in one of three bands is a colour
+    absent = each.all(axis=2)  # as in GDAL: a pixel is absent only if all bands are
     empty = each if chosen.dtype.kind == "f" else absent[..., None]
     if empty.any():
         chosen = np.where(empty, chosen.dtype.type(0), chosen)
