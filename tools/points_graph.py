@@ -37,9 +37,11 @@ from deepdetect.detector.points.detection import (
     CANDIDATES_PER_KEYPOINT,
     MIN_CANDIDATES,
     SIZE_PER_SIGMA,
+    WINDOW_PER_LEVEL,
     least_distances,
 )
 from deepdetect.detector.points.hessian_scales import (
+    ANGLE_OCTAVES,
     LEAST_RESPONSE,
     NMS_RADIUS,
     OCTAVES,
@@ -49,8 +51,6 @@ from deepdetect.detector.points.hessian_scales import (
 from deepdetect.detector.points.ranker import MAX_DEVIATIONS, load_ranker
 from deepdetect.detector.pretrained import POINTS, POINTS_GRAPH
 from deepdetect.features.kernels import ATAN, BINS, RADIUS_PER_WINDOW
-from deepdetect.features.scale_space import SIZE_PER_SIGMA as SIFT_SIZE_PER_SIGMA
-from deepdetect.features.scale_space import WINDOW_PER_SIGMA
 from deepdetect.features.selection import MAX_OFFSET_PX
 
 OPSET, IR_VERSION = 17, 8
@@ -74,9 +74,6 @@ NEAR, OTHERS = np.arange(-1, 3), [0, 2, 3]
 
 CHUNK = 2048
 """Number of candidates measured at once: all their patches would take 70 MB and more."""
-
-WINDOWS_PX = WINDOW_PER_SIGMA * SIZE_PER_SIGMA / SIFT_SIZE_PER_SIGMA * SIGMAS_PX
-"""Sigmas of the windows for orientations, in pixels of the image, by the level of the point."""
 
 TOGETHER = 16
 """Number of neighbours that a convolution smooths at once, as its channels."""
@@ -607,21 +604,25 @@ def directions(levels: Levels, x: Any, y: Any, level: Any) -> Any:
 
 def _turn(levels: Levels, x: Any, y: Any, level: Any) -> Any:
     """Return the orientations (B, K) of points, (B, 1, 1, 1, K), as `strongest_directions` does."""
-    coarser, pixel = np.clip(np.arange(1, len(OCTAVES) + 1), 0, len(OCTAVES) - 1), 2.0**OCTAVES
-    windows = (WINDOWS_PX / pixel[coarser]).astype(np.float32)
+    coarser = np.clip(np.arange(1, len(OCTAVES) + 1), 0, len(OCTAVES) - 1)
+    pixel, step = 2 ** ANGLE_OCTAVES[coarser], 2 ** (ANGLE_OCTAVES - OCTAVES)[coarser]
+    windows = (WINDOW_PER_LEVEL * SIGMAS_PX / pixel).astype(np.float32)
     most = int(np.rint(RADIUS_PER_WINDOW * windows[FIRST : LAST + 1]).max())
     graph, reach = level.graph, np.arange(-most - 1, most + 2)
-    scale, window = (graph.tensor(each).Gather(level) for each in (pixel[coarser], windows))
+    scale, window, step = (
+        graph.tensor(each).Gather(level) for each in (pixel * 1.0, windows, step)
+    )
     level, radius = level + 1, (window * float(RADIUS_PER_WINDOW)).Round()
     place, weight = levels.places(level, 0, 0)[0], graph.tensor(1.0)
     strides = levels.widths.Gather(level) + 2 * MARGIN, 1
     for value, sides, axis, stride in zip(
         (y, x), (levels.heights, levels.widths), (0, 1), strides, strict=True
     ):
-        middle, side = (value / scale).Round().Cast(to=INT64), sides.Gather(level)
+        middle = (value / scale).Round().Cast(to=INT64)
+        side = (sides.Gather(level) + step - 1) / step
         steps = reach.reshape((-1, 1, 1) if axis == 0 else (-1, 1))
         where = middle + steps
-        place = place + where.Max(0).Min(side - 1) * stride
+        place = place + where.Max(0).Min(side - 1) * step * stride
         # The outermost pixels have no gradient.
         near = graph.tensor(np.abs(steps) * 1.0).LessOrEqual(radius)
         near = near.And(where.Greater(0)).And(where.Less(side - 1))

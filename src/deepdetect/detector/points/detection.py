@@ -18,6 +18,7 @@ from ...features.selection import (
 )
 from .candidate_features import describe_candidates
 from .hessian_scales import (
+    ANGLE_OCTAVES,
     OCTAVES,
     SIGMAS_PX,
     Candidates,
@@ -49,6 +50,9 @@ score (mostly repeatability) from 0.539 to 0.543; 1.5 or 2.3 for 2 px changed it
 
 SIZE_PER_SIGMA = 2.5
 """Diameter at which a keypoint is described, divided by the sigma of its scale. Chosen by hand."""
+
+WINDOW_PER_LEVEL = WINDOW_PER_SIGMA * SIZE_PER_SIGMA / SIFT_SIZE_PER_SIGMA
+"""Sigma of the window for an orientation, as in SIFT, divided by the sigma of the point's level."""
 
 
 def least_distances(sigma_px: np.ndarray) -> np.ndarray:
@@ -125,13 +129,12 @@ def candidate_angles(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
 
     angles = np.empty(len(candidates), np.float32)
     for level in np.unique(candidates.level):
-        own, pixel = candidates.level == level, 2.0 ** OCTAVES[level + 1]
+        own, next_level = candidates.level == level, level + 1
+        octave = ANGLE_OCTAVES[next_level]
+        step, pixel = 1 << (octave - OCTAVES[next_level]), 2.0**octave
+        image = np.ascontiguousarray(space.level(space.smooth, next_level)[::step, ::step])
         pixels = np.rint(candidates.xy[own] / pixel).astype(np.int64)
-        windows = np.full(
-            len(pixels),
-            WINDOW_PER_SIGMA * SIZE_PER_SIGMA / SIFT_SIZE_PER_SIGMA * SIGMAS_PX[level] / pixel,
-        )
-        image = space.level(space.smooth, level + 1)
+        windows = np.full(len(pixels), WINDOW_PER_LEVEL * SIGMAS_PX[level] / pixel)
         angles[own] = strongest_directions(image, pixels, windows)
     return angles
 

@@ -16,9 +16,13 @@ SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
 """Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Seven levels have
 candidates. The finest and the two coarsest only serve the ranker's features. Chosen by hand."""
 
-OCTAVES = np.log2(SIGMAS_PX / 2).clip(0).astype(np.int64)
+OCTAVES = np.log2(SIGMAS_PX / 3).clip(0).astype(np.int64)
 """A level of octave o has every 2^o-th pixel of every 2^o-th row, which saves time. Its sigma is at
-least 2 of these pixels: at 1.5, 1 % fewer maxima were found again on pairs made of photos/val."""
+least 3 of these pixels: on pairs made of photos/val, the mean repeatability of 2,048 keypoints
+within 3 px is then 0.716, with at least 2 pixels 0.713, and with all pixels 0.717."""
+
+ANGLE_OCTAVES = np.log2(SIGMAS_PX / 2).clip(0).astype(np.int64)
+"""For orientations, which need less detail, only every 2^o-th pixel of the image is read."""
 
 VARIANCES = ((SIGMAS_PX / 2.0**OCTAVES) ** 2).astype(np.float32)
 """Squares of the sigmas in pixels of their levels, which normalise the derivatives."""

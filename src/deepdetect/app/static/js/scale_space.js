@@ -28,13 +28,19 @@ export function* layersOf(gray, width, height, sizes) {
   const last = Math.max(...rows.keys());
   let [image, reached, scale] = [Float32Array.from(gray), 0, 1];
   for (let level = 0; level <= last; level++) {
-    if (SIGMAS_PX[level] >= 4 * scale) {
+    if (SIGMAS_PX[level] >= 6 * scale) {
       [image, width, height] = halved(image, width, height);
       scale *= 2;
     }
     image = blur(image, width, height, Math.sqrt(SIGMAS_PX[level] ** 2 - reached ** 2) / scale);
     reached = SIGMAS_PX[level];
-    if (rows.has(level)) yield { image, width, height, scale, rows: rows.get(level) };
+    if (!rows.has(level)) continue;
+    const own = { image, width, height, scale, rows: rows.get(level) };
+    if (reached >= 4 * scale) {
+      [own.image, own.width, own.height] = halved(image, width, height);
+      own.scale = 2 * scale;
+    }
+    yield own;
   }
 }
 
