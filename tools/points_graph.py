@@ -382,9 +382,9 @@ def _measure(levels: Levels, level: Any, row: Any, column: Any, ranks: Any) -> t
 
     # Windows around each candidate's nearest pixel in its own level and others, (B, 4, 7, 7, K).
     near = level + NEAR[:, None]
-    own, other = pixel.Gather(level), pixel.Gather(near)
+    factor, other = pixel.Gather(level), pixel.Gather(near)
     down, right = (
-        ((each * own + other / 2) / other).Min(sides.Gather(near) - 1)
+        ((each * factor + other / 2) / other).Min(sides.Gather(near) - 1)
         for each, sides in ((row, levels.heights), (column, levels.widths))
     )
     values = look(near, down, right, MARGIN)
@@ -456,11 +456,8 @@ def _measure(levels: Levels, level: Any, row: Any, column: Any, ranks: Any) -> t
     }
     response = windows.Slice([1], [2], [1])
     x, y = (
-        (
-            (each.Cast(to=FLOAT) + _peak_offset(response, *axis).Squeeze([2, 3]))
-            * pixel.Gather(level).Cast(to=FLOAT)
-        ).Squeeze([1])
-        for each, axis in ((column, (0, 1)), (row, (1, 0)))
+        ((each.Cast(to=FLOAT) + offset.Squeeze([2, 3])) * factor.Cast(to=FLOAT)).Squeeze([1])
+        for each, offset in zip((column, row), _peak_offsets(response), strict=True)
     )
     return x, y, _rank(graph, features)
 
@@ -499,14 +496,20 @@ def _log_slope(values: Any, margin: int, variance: Any) -> Any:
     return ((dx * dx + dy * dy) * (variance * 0.25) + GRADIENT_FLOOR).Log()
 
 
-def _peak_offset(response: Any, down: int, right: int) -> Any:
-    """Return the offset of a parabola's maximum from the centre of windows, along an axis."""
-    before, middle, after = (
-        _at(response, NMS_RADIUS, step * down, step * right) for step in (-1, 0, 1)
-    )
-    bend = (middle - before) + (middle - after)
-    offset = ((after - before) / (bend * 2.0)).Clip(-MAX_OFFSET_PX, MAX_OFFSET_PX)
-    return bend.Greater(0.0).Where(offset, 0.0)
+def _peak_offsets(response: Any) -> list[Any]:
+    """Return the offsets in x and y of maxima from the centres of windows, as `refine_peaks`."""
+    near = [[_at(response, NMS_RADIUS, j, i) for i in (-1, 0, 1)] for j in (-1, 0, 1)]
+    dx, dy = (near[1][2] - near[1][0]) * 0.5, (near[2][1] - near[0][1]) * 0.5
+    xx = (near[1][0] - near[1][1]) + (near[1][2] - near[1][1])
+    yy = (near[0][1] - near[1][1]) + (near[2][1] - near[1][1])
+    mixed = ((near[0][0] - near[0][2]) + (near[2][2] - near[2][0])) * 0.25
+    bend = xx * yy - mixed * mixed
+    mixed = bend.Greater(0.0).And(xx.Less(0.0)).Where(mixed, 0.0)
+    bend = xx * yy - mixed * mixed
+    offsets = (mixed * dy - yy * dx) / bend, (mixed * dx - xx * dy) / bend
+    return [
+        bend.Greater(0.0).Where(each.Clip(-MAX_OFFSET_PX, MAX_OFFSET_PX), 0.0) for each in offsets
+    ]
 
 
 def _rank(graph: Graph, features: dict[tuple[int, ...], Any]) -> Any:

@@ -20,7 +20,7 @@ from ..features.selection import check_max_keypoints
 from ..features.sift import ROOT_SIFT
 from ..io.image import load_image
 
-LEAST_LOGIT = 0.0
+LEAST_LOGIT = 7.0
 """Without a limit of their number, keypoints have at least this logit. On photos/val, images then
 have as many keypoints as `cv2.SIFT_create()` finds in them, in the mean of their logarithms."""
 
@@ -60,8 +60,10 @@ class DeepDetectFeature2D:
         check_channels(channels)
         check_max_keypoints(max_keypoints)
         self._channels, self._most = channels, max_keypoints
-        self._as_many_as_sift = detector is None and max_keypoints is None
-        self._detector = PointDetector(None) if detector is None else detector
+        if detector is None:
+            least = LEAST_LOGIT if max_keypoints is None else None
+            detector = PointDetector(max_keypoints, min_logit=least)
+        self._detector = detector
 
     def detect(self, image: Any, mask: np.ndarray | None = None) -> tuple[cv2.KeyPoint, ...]:
         """Detect keypoints.
@@ -142,11 +144,7 @@ class DeepDetectFeature2D:
     def _find(self, rgb: np.ndarray, mask: np.ndarray | None) -> Keypoints:
         """Detect keypoints where OpenCV's mask is not 0."""
         ignore = None if mask is None else np.asarray(mask) == 0
-        points = self._detector.detect(rgb, ignore=ignore, max_keypoints=self._most)
-        if not self._as_many_as_sift:
-            return points
-        assert points.logits is not None
-        return points.best(int(np.count_nonzero(points.logits >= LEAST_LOGIT)))
+        return self._detector.detect(rgb, ignore=ignore, max_keypoints=self._most)
 
     def _load(self, image: Any) -> np.ndarray:
         return load_image(image, channels=self._channels)

@@ -67,6 +67,7 @@ def detect_points(
     spread: Spread = "none",
     ignore: np.ndarray | None = None,
     ranker: Ranker | None = None,
+    min_logit: float | None = None,
 ) -> Keypoints:
     """Detect keypoints of all scales in a (H, W) uint8 image, best first, as `PointDetector` does.
 
@@ -85,6 +86,9 @@ def detect_points(
     strongest = None if limit is None else max(CANDIDATES_PER_KEYPOINT * limit, MIN_CANDIDATES)
     space = build_scale_space(gray)
     candidates, logits = rank_candidates(space, strongest, ignore=ignore, ranker=ranker)
+    if min_logit is not None:
+        some = logits >= min_logit
+        candidates, logits = candidates[some], logits[some]
     size = width, height
     if not len(candidates):
         none = np.empty(0, np.float32)

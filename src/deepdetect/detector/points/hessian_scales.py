@@ -113,7 +113,7 @@ def find_candidates(
 ) -> Candidates:
     """Find maxima of |det Hessian| in each level except the finest and the two coarsest.
 
-    Positions are refined by parabolas in x and y. The outermost pixels are not searched. Returns
+    Positions are refined by paraboloids. The outermost pixels are not searched. Returns
     the `strongest` candidates (None: all) outside `ignore`, (H, W) bool, the strongest first.
     """
     from .kernels import mark_peaks, refine_peaks

@@ -80,18 +80,28 @@ def mark_peaks(response, least, peak):  # type: ignore[no-untyped-def]
 def refine_peaks(pixels, responses, layout, octaves, most, xy):  # type: ignore[no-untyped-def]
     """Write the image positions of maxima, given by level, row and column, into `xy`, (N, 2).
 
-    A parabola through a maximum and its neighbours moves it by up to `most` pixels in x and in y.
+    A paraboloid through the 3x3 pixels moves each by up to `most` pixels in x and in y.
     """
+    near = np.empty((3, 3))
     for n in range(len(pixels)):
         level, row, column = pixels[n, 0], pixels[n, 1], pixels[n, 2]
         start, _, width = layout[level]
         here = start + row * width + column
-        middle = np.float64(responses[here])
-        for axis, step, place in ((0, 1, column), (1, width, row)):
-            before, after = np.float64(responses[here - step]), np.float64(responses[here + step])
-            bend = 2 * middle - before - after
-            offset = (after - before) / (2 * bend) if bend > 0 else 0.0
-            xy[n, axis] = (place + max(min(offset, most), -most)) * (1 << octaves[level])
+        for j in range(3):
+            for i in range(3):
+                near[j, i] = responses[here + (j - 1) * width + i - 1]
+        dx, dy = (near[1, 2] - near[1, 0]) / 2, (near[2, 1] - near[0, 1]) / 2
+        xx = near[1, 0] - 2 * near[1, 1] + near[1, 2]
+        yy = near[0, 1] - 2 * near[1, 1] + near[2, 1]
+        mixed = (near[0, 0] + near[2, 2] - near[0, 2] - near[2, 0]) / 4
+        bend = xx * yy - mixed * mixed
+        if not (bend > 0 and xx < 0):
+            mixed, bend = 0.0, xx * yy
+        across = (mixed * dy - yy * dx) / bend if bend > 0 else 0.0
+        down = (mixed * dx - xx * dy) / bend if bend > 0 else 0.0
+        scale = 1 << octaves[level]
+        xy[n, 0] = (column + max(min(across, most), -most)) * scale
+        xy[n, 1] = (row + max(min(down, most), -most)) * scale
 
 
 @compiled(nogil=True, error_model="numpy")
