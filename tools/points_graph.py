@@ -15,9 +15,9 @@ product of zeros and ones.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -37,25 +37,20 @@ from deepdetect.detector.points.detection import (
     CANDIDATES_PER_KEYPOINT,
     MIN_CANDIDATES,
     SIZE_PER_SIGMA,
+    WINDOW_PER_LEVEL,
     least_distances,
 )
 from deepdetect.detector.points.hessian_scales import (
+    ANGLE_OCTAVES,
     LEAST_RESPONSE,
     NMS_RADIUS,
+    OCTAVES,
     SIGMAS_PX,
     VARIANCES,
 )
 from deepdetect.detector.points.ranker import MAX_DEVIATIONS, load_ranker
 from deepdetect.detector.pretrained import POINTS, POINTS_GRAPH
 from deepdetect.features.kernels import ATAN, BINS, RADIUS_PER_WINDOW
-from deepdetect.features.scale_space import (
-    BASE_SIGMA_PX,
-    CAMERA_SIGMA_PX,
-    LAYERS,
-    MIN_SIDE_PX,
-    WINDOW_PER_SIGMA,
-)
-from deepdetect.features.scale_space import SIZE_PER_SIGMA as SIFT_SIZE_PER_SIGMA
 from deepdetect.features.selection import MAX_OFFSET_PX
 
 OPSET, IR_VERSION = 17, 8
@@ -79,9 +74,6 @@ NEAR, OTHERS = np.arange(-1, 3), [0, 2, 3]
 
 CHUNK = 2048
 """Number of candidates measured at once: all their patches would take 70 MB and more."""
-
-OCTAVES, REACH = 3, 15
-"""Octaves of SIFT's scale space, and radius of gradient windows, that the sizes of points need."""
 
 TOGETHER = 16
 """Number of neighbours that a convolution smooths at once, as its channels."""
@@ -111,9 +103,11 @@ def points_model() -> onnx.ModelProto:
     count = graph.constant([2048], MAX_KEYPOINTS)
     gray = gray_of(Tensor(graph, "image"))
     limit = (count * CANDIDATES_PER_KEYPOINT).Max([MIN_CANDIDATES])
-    x, y, scores, sizes = choose(*rank_candidates(gray, limit), count)
+    levels = scale_space(gray)
+    x, y, scores, sizes, level = choose(*rank_candidates(levels, limit), count)
     xy = graph.join([x.Unsqueeze([2]), y.Unsqueeze([2])], axis=2)
-    tensors = xy, scores, sizes, directions(gray, x, y, sizes)
+    angles = scores.Greater(0.0).Where(directions(levels, x, y, level), 0.0)
+    tensors = xy, scores, sizes, angles
     shapes = [["batch", "count", *last] for last in ([2], [], [], [])]
     outputs = [(name, FLOAT, shape) for name, shape in zip(POINTS, shapes, strict=True)]
     return graph.model([("image", FLOAT, ["batch", 3, "height", "width"])], outputs, tensors)
@@ -123,7 +117,7 @@ def candidates_model() -> onnx.ModelProto:
     """Make the graph that maps grey images to ranked candidates, at most an input `limit`."""
     graph = Graph(PREFIX)
     gray, limit = Tensor(graph, "gray").Cast(to=FLOAT), Tensor(graph, "limit")
-    x, y, level, logits = rank_candidates(gray, limit)
+    x, y, level, logits = rank_candidates(scale_space(gray), limit)
     tensors = x, y, graph.tensor(SIGMAS_PX).Gather(level), logits
     outputs = [(name, FLOAT, ["batch", "count"]) for name in ("x", "y", "sigmas", "logits")]
     inputs = ("gray", UINT8, ["batch", 1, "height", "width"]), ("limit", INT64, [1])
@@ -223,27 +217,75 @@ def gray_of(image: Any) -> Any:
     return ((gray + LUMA_UNIT / 2) / LUMA_UNIT).Floor()
 
 
-def rank_candidates(gray: Any, limit: Any) -> tuple[Any, Any, Any, Any]:
-    """Find the strongest candidates of (B, 1, H, W) grey images, at most `limit`, and rank them.
+class Levels(NamedTuple):
+    """Scale space of images, whose mean is (B, 1, 1, 1).
+
+    `flat` holds all levels of an image in one row. Each is padded by `MARGIN`, mirrored at its
+    outermost rows and columns, as in the filters. `starts`, `heights` and `widths` are (L,): the
+    first index in `flat`, and the sides without padding. `frames` are the padded levels themselves.
+    """
+
+    mean: Any
+    flat: Any
+    starts: Any
+    heights: Any
+    widths: Any
+    frames: list[Any]
+
+    def at(self, graph: Graph) -> Levels:
+        """Return the same tensors in the graph of a loop body."""
+        return Levels(*(graph.tensor(each) for each in self[:-1]), [])
+
+    def places(self, level: Any, row: Any, column: Any) -> tuple[Any, Any]:
+        """Return the indices in `flat` of pixels, and the steps from each row to the next."""
+        stride = self.widths.Gather(level) + 2 * MARGIN
+        return self.starts.Gather(level) + stride * (row + MARGIN) + (column + MARGIN), stride
+
+
+def scale_space(gray: Any) -> Levels:
+    """Return the scale space of (B, 1, H, W) grey images, as `build_scale_space` computes it."""
+    graph, octave, reached, frames, sides = gray.graph, 0, 0.0, [], []
+    mean = gray.ReduceMean(axes=[1, 2, 3]).Round()
+    smooth = (gray - mean) / 255.0
+    for k, sigma in enumerate(SIGMAS_PX):
+        height, width = (smooth.Shape(start=axis, end=axis + 1) for axis in (2, 3))
+        if OCTAVES[k] > octave:
+            # After slices up to `END` by steps, OpenVINO 2026.4 confuses sides (request 37932).
+            smooth = smooth.Slice([0], height, [2], [2]).Slice([0], width, [3], [2])
+            height, width = (smooth.Shape(start=axis, end=axis + 1) for axis in (2, 3))
+            octave = OCTAVES[k]
+        # The variances of Gaussians add up, so each level smooths the previous one.
+        smooth = _blur(smooth, np.sqrt(sigma**2 - reached**2) / 2.0**octave, height, width)
+        frames.append(_framed(_framed(smooth, MARGIN, 2, height), MARGIN, 3, width))
+        sides.append((height, width))
+        reached = sigma
+    heights, widths = (graph.join(each, axis=0) for each in zip(*sides, strict=True))
+    areas = (heights + 2 * MARGIN) * (widths + 2 * MARGIN)
+    flat = graph.join([each.Flatten() for each in frames], axis=1)
+    return Levels(mean, flat, areas.CumSum(0, exclusive=1), heights, widths, frames)
+
+
+def rank_candidates(levels: Levels, limit: Any) -> tuple[Any, Any, Any, Any]:
+    """Find the strongest candidates in scale spaces, at most `limit`, and rank them.
 
     Returns:
         x, y, level and logit, (B, K) each, the strongest first. The candidates of an image are
         followed by at least one padding entry, whose logit is -infinity.
     """
-    graph = gray.graph
-    height, width = (gray.Shape(start=axis, end=axis + 1) for axis in (2, 3))
-    mean = gray.ReduceMean(axes=[1, 2, 3]).Round()
-    maps, peaks = zip(*_levels((gray - mean) / 255.0, height, width), strict=True)
-    strength = graph.join(peaks[FIRST : LAST + 1], axis=1)
+    graph = levels.flat.graph
+    strength = graph.join([_peaks(levels, k) for k in range(FIRST, LAST + 1)], axis=1)
     count = strength.Greater(0.0).Cast(to=FLOAT).ReduceSum([1], keepdims=0)
     count = count.ReduceMax(axes=[0]).Cast(to=INT64)
     count = count.Min(limit).Max([1])
     missing = count.Mod(CHUNK) * -1 + CHUNK
     padding = graph.join([[0, 0, 0], missing], axis=0)
     strength, place = (each.Pad(padding) for each in strength.TopK(count, axis=1, outputs=2))
-    level, pixel = place / (height * width) + FIRST, place.Mod(height * width)
-    pixels = level, pixel / width, pixel.Mod(width)
-    flat = graph.join(maps, axis=1).Flatten()
+    ends = (levels.heights * levels.widths).Slice([FIRST], [LAST + 1]).CumSum(0)
+    level = place.Unsqueeze([2]).Less(ends).Cast(to=INT64).ReduceSum([2], keepdims=0)
+    level = level * -1 + (LAST + 1)
+    before = graph.join([[0], ends], axis=0).Gather(level - FIRST)
+    width = levels.widths.Gather(level)
+    pixels = level, (place - before) / width, (place - before).Mod(width)
 
     def measure(number: Any, going: Any) -> tuple[Any, ...]:
         start = number.Reshape([1]) * CHUNK
@@ -252,8 +294,7 @@ def rank_candidates(gray: Any, limit: Any) -> tuple[Any, Any, Any, Any]:
             for each in pixels
         )
         ranks = start + np.arange(1, CHUNK + 1)
-        around = (number.graph.tensor(each) for each in (flat, height, width, mean))
-        return going.Identity(), *_measure(*around, *own, ranks)
+        return going.Identity(), *_measure(levels.at(number.graph), *own, ranks)
 
     x, y, logits = (
         each.Transpose(perm=[1, 0, 2]).Reshape([0, -1])
@@ -262,28 +303,18 @@ def rank_candidates(gray: Any, limit: Any) -> tuple[Any, Any, Any, Any]:
     return x, y, level, strength.Greater(0.0).Where(logits, -np.inf)
 
 
-def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield levels, padded by `MARGIN`, and (B, H W) strengths of maxima, 0 elsewhere, or None.
-
-    The padding mirrors the image at its outermost rows and columns, as the filters do.
-    """
-    inner = []
-    for side in (height, width):
-        place = smooth.graph.add("Range", 0, side.Squeeze(), 1)
+def _peaks(levels: Levels, k: int) -> Any:
+    """Return the (B, H W) strengths of a level's maxima, 0 elsewhere."""
+    graph, frame, inner = levels.flat.graph, levels.frames[k], []
+    for sides in (levels.heights, levels.widths):
+        side = sides.Slice([k], [k + 1])
+        place = graph.add("Range", 0, side.Squeeze(), 1)
         inner.append(place.Greater(0).And(place.Less(side - 1)))
     inside = inner[0].Unsqueeze([1]).And(inner[1])
-    for k, step in enumerate(np.sqrt(np.diff(SIGMAS_PX**2, prepend=0.0))):
-        # The variances of Gaussians add up, so each level smooths the previous one.
-        smooth = _blur(smooth, step, height, width)
-        frame = _framed(_framed(smooth, MARGIN, 2, height), MARGIN, 3, width)
-        if not FIRST <= k <= LAST:
-            yield frame, None
-            continue
-        response = _determinant(frame, MARGIN, VARIANCES[k]).Abs()
-        window = {"kernel_shape": [2 * NMS_RADIUS + 1] * 2, "pads": [NMS_RADIUS] * 4}
-        peak = response.Equal(response.MaxPool(**window)).And(inside)
-        peak = peak.And(response.Greater(LEAST_RESPONSE))
-        yield frame, peak.Where(response, 0.0).Flatten()
+    response = _determinant(frame, MARGIN, VARIANCES[k]).Abs()
+    window = {"kernel_shape": [2 * NMS_RADIUS + 1] * 2, "pads": [NMS_RADIUS] * 4}
+    peak = response.Equal(response.MaxPool(**window)).And(inside)
+    return peak.And(response.Greater(LEAST_RESPONSE)).Where(response, 0.0).Flatten()
 
 
 def _framed(values: Any, radius: int, axis: int, side: Any, more: Any = 0) -> Any:
@@ -331,29 +362,33 @@ def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
     return values
 
 
-def _measure(
-    flat: Any, height: Any, width: Any, mean: Any, level: Any, row: Any, column: Any, ranks: Any
-) -> tuple[Any, Any, Any]:
+def _measure(levels: Levels, level: Any, row: Any, column: Any, ranks: Any) -> tuple[Any, Any, Any]:
     """Return x, y and logits of candidates, as `describe_candidates` and the ranker compute them.
 
-    `flat` contains all padded levels of an image in one row. Candidates are the last axis of all
-    tensors, so that slices along other axes copy long rows.
+    Candidates are the last axis of all tensors, so that slices along other axes copy long rows.
     """
     graph, variances = level.graph, level.graph.tensor(VARIANCES)
-    down = width + 2 * MARGIN
-    deeper = down * (height + 2 * MARGIN)
+    pixel = graph.tensor(1 << OCTAVES)
 
-    def look(level: Any, row: Any, column: Any, steps: Sequence[Any], *shape: int) -> Any:
-        """Return the smoothed image at pixels shifted by steps in level, row and column."""
-        steps = [each.reshape(-1, 1) for each in np.meshgrid(*steps, indexing="ij")]
-        pixels = deeper * level + down * (row + MARGIN) + (column + MARGIN)
-        pixels = pixels.Unsqueeze([2]) + (deeper * steps[0] + down * steps[1] + steps[2])
-        return flat.GatherElements(pixels.Reshape([0, -1]), axis=1).Reshape([0, *shape, -1])
+    def look(level: Any, row: Any, column: Any, reach: int) -> Any:
+        """Return the smoothed image within `reach` pixels, (B, N, side, side, K)."""
+        steps, places = np.arange(-reach, reach + 1), levels.places(level, row, column)
+        place, stride = (each.Unsqueeze([2, 3]) for each in places)
+        place = place + stride * steps[:, None, None] + steps[:, None]
+        values = levels.flat.GatherElements(place.Reshape([0, -1]), axis=1)
+        count = row.Shape(start=1, end=2)
+        shape = graph.join([[0], count, [len(steps), len(steps), -1]], axis=0)
+        return values.Reshape(shape)
 
-    # Windows around each candidate in its own level and others, (B, 4, 7, 7, K).
-    side = np.arange(-MARGIN, MARGIN + 1)
-    values = look(level, row, column, (NEAR, side, side), len(NEAR), len(side), len(side))
-    scale = variances.Gather(level + NEAR[:, None]).Unsqueeze([2, 3])
+    # Windows around each candidate's nearest pixel in its own level and others, (B, 4, 7, 7, K).
+    near = level + NEAR[:, None]
+    factor, other = pixel.Gather(level), pixel.Gather(near)
+    down, right = (
+        ((each * factor + other / 2) / other).Min(sides.Gather(near) - 1)
+        for each, sides in ((row, levels.heights), (column, levels.widths))
+    )
+    values = look(near, down, right, MARGIN)
+    scale = variances.Gather(near).Unsqueeze([2, 3])
     windows = _determinant(values, 1, scale).Abs()
     highest = _log(windows.ReduceMax(axes=[2, 3], keepdims=0)).Gather(OTHERS, axis=1)
     determinant, light, slope = (
@@ -379,12 +414,11 @@ def _measure(
         .Max(0)
         .Min(last)
         for each, table, last in (
-            (column, np.concatenate(ring_offsets()[0]), width - 1),
-            (row, np.concatenate(ring_offsets()[1]), height - 1),
+            (column, np.concatenate(ring_offsets()[0]), levels.widths.Gather(level) - 1),
+            (row, np.concatenate(ring_offsets()[1]), levels.heights.Gather(level) - 1),
         )
     )
-    near, points = np.arange(-1, 2), RING_POINTS * len(RING_RADII)
-    values = look(level, below, right, ([0], near, near), points, 3, 3)
+    values = look(level, below, right, 1)
     scale = variances.Gather(level).Unsqueeze([2, 3])
     responses, slopes, lights = (
         each.Reshape([0, RING_POINTS, len(RING_RADII), -1])
@@ -399,6 +433,7 @@ def _measure(
         return getattr(ring, f"Reduce{kind}")(axes=[1], keepdims=0)
 
     ring = 21 + 8 * np.arange(len(RING_RADII))
+    area = (levels.heights * levels.widths).Slice([0], [1])
     features = {  # by their columns
         (0,): (own + 9.0) / 3.0,
         (1, 2, 3): (others - own) / 2.0,
@@ -406,7 +441,7 @@ def _measure(
         (5, 7, 9, 11): trace,
         (6, 8, 10, 12): trace.Abs(),
         (13, 14, 15, 16): (slope - own) / 4.0,
-        (17,): (own_light + mean.Squeeze([3]) / 255.0) * 2.0 - 1.0,
+        (17,): (own_light + levels.mean.Squeeze([3]) / 255.0) * 2.0 - 1.0,
         (18, 19, 20): (highest - others) / 2.0,
         (*ring,): (over(responses, "Mean") - own) / 2.0,
         (*ring + 1,): (over(responses, "Max") - own) / 2.0,
@@ -416,15 +451,13 @@ def _measure(
         (*ring + 5,): (over(lights, "Min") / 2.0).Atan(),
         (*ring + 6,): (over(slopes, "Mean") - own) / 4.0,
         (*ring + 7,): (over(slopes, "Max") - own) / 4.0,
-        (53,): own * 0.0
-        + (ranks.Cast(to=FLOAT) / (height * width).Cast(to=FLOAT)).Log() / 2.0
-        + 3.0,
+        (53,): own * 0.0 + (ranks.Cast(to=FLOAT) / area.Cast(to=FLOAT)).Log() / 2.0 + 3.0,
         (54,): (level - 4).Cast(to=FLOAT) / 3.0,
     }
     response = windows.Slice([1], [2], [1])
     x, y = (
-        (each.Cast(to=FLOAT) + _peak_offset(response, *axis).Squeeze([2, 3])).Squeeze([1])
-        for each, axis in ((column, (0, 1)), (row, (1, 0)))
+        ((each.Cast(to=FLOAT) + offset.Squeeze([2, 3])) * factor.Cast(to=FLOAT)).Squeeze([1])
+        for each, offset in zip((column, row), _peak_offsets(response), strict=True)
     )
     return x, y, _rank(graph, features)
 
@@ -463,14 +496,20 @@ def _log_slope(values: Any, margin: int, variance: Any) -> Any:
     return ((dx * dx + dy * dy) * (variance * 0.25) + GRADIENT_FLOOR).Log()
 
 
-def _peak_offset(response: Any, down: int, right: int) -> Any:
-    """Return the offset of a parabola's maximum from the centre of windows, along an axis."""
-    before, middle, after = (
-        _at(response, NMS_RADIUS, step * down, step * right) for step in (-1, 0, 1)
-    )
-    bend = (middle - before) + (middle - after)
-    offset = ((after - before) / (bend * 2.0)).Clip(-MAX_OFFSET_PX, MAX_OFFSET_PX)
-    return bend.Greater(0.0).Where(offset, 0.0)
+def _peak_offsets(response: Any) -> list[Any]:
+    """Return the offsets in x and y of maxima from the centres of windows, as `refine_peaks`."""
+    near = [[_at(response, NMS_RADIUS, j, i) for i in (-1, 0, 1)] for j in (-1, 0, 1)]
+    dx, dy = (near[1][2] - near[1][0]) * 0.5, (near[2][1] - near[0][1]) * 0.5
+    xx = (near[1][0] - near[1][1]) + (near[1][2] - near[1][1])
+    yy = (near[0][1] - near[1][1]) + (near[2][1] - near[1][1])
+    mixed = ((near[0][0] - near[0][2]) + (near[2][2] - near[2][0])) * 0.25
+    bend = xx * yy - mixed * mixed
+    mixed = bend.Greater(0.0).And(xx.Less(0.0)).Where(mixed, 0.0)
+    bend = xx * yy - mixed * mixed
+    offsets = (mixed * dy - yy * dx) / bend, (mixed * dx - xx * dy) / bend
+    return [
+        bend.Greater(0.0).Where(each.Clip(-MAX_OFFSET_PX, MAX_OFFSET_PX), 0.0) for each in offsets
+    ]
 
 
 def _rank(graph: Graph, features: dict[tuple[int, ...], Any]) -> Any:
@@ -490,14 +529,14 @@ def _rank(graph: Graph, features: dict[tuple[int, ...], Any]) -> Any:
 def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
     """Keep candidates, best first, that are not near a better kept one.
 
-    Returns x, y, scores and sizes of the first kept ones, (B, `count`) each.
+    Returns x, y, scores, sizes and levels of the first kept ones, (B, `count`) each.
     """
     graph = x.graph
     logits, order = logits.TopK(logits.Shape(start=1), axis=1, outputs=2)
     valid = logits.Greater(-np.finfo(np.float32).max)
     level = level.GatherElements(order, axis=1)
     tail = (logits.Abs() + 1.0).Reciprocal() * 0.5
-    x, y, scores, sizes, radii = (
+    x, y, scores, sizes, radii, level = (
         valid.Where(each, nothing)
         for each, nothing in (
             (x.GatherElements(order, axis=1), -1.0),
@@ -505,6 +544,7 @@ def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
             (logits.Less(0.0).Where(tail, tail * -1.0 + 1.0), 0.0),
             (graph.tensor(SIZE_PER_SIGMA * SIGMAS_PX).Gather(level), 0.0),
             (graph.tensor(least_distances(SIGMAS_PX)).Gather(level), 0.0),
+            (level, FIRST),
         )
     )
     last = x.Shape(start=1) - 1
@@ -542,75 +582,57 @@ def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
     found = graph.tensor([[0]]).Expand(graph.join([images, [1]], axis=0))
     rows, _ = graph.loop(((last + 1) / BLOCK).Squeeze(), suppress, rows, found)
     rows = rows.Slice([0], count, [1])
-    return [each.GatherElements(rows, axis=1) for each in (x, y, scores, sizes)]
+    return [each.GatherElements(rows, axis=1) for each in (x, y, scores, sizes, level)]
 
 
-def directions(gray: Any, x: Any, y: Any, sizes: Any) -> Any:
-    """Return the dominant orientations of points, (B, K) degrees, as `dominant_angles` does."""
-    graph, sigma, layers = gray.graph, CAMERA_SIGMA_PX, []
-    for _ in range(OCTAVES):
-        height, width = (gray.Shape(start=axis, end=axis + 1) for axis in (2, 3))
-        for layer in range(LAYERS + 1):
-            wanted = BASE_SIGMA_PX * 2 ** (layer / LAYERS)
-            if wanted > sigma:
-                gray, sigma = _blur(gray, (wanted**2 - sigma**2) ** 0.5, height, width), wanted
-            if layer:
-                layers.append((gray.Flatten(), height, width))
-        # After a slice up to `END` by steps, OpenVINO 2026.4 confuses sides (its request 37932).
-        gray = gray.Slice([0], height, [2], [2]).Slice([0], width, [3], [2])
-        sigma = BASE_SIGMA_PX
-    images, heights, widths = zip(*layers, strict=True)
-    flat, heights, widths = (
-        graph.join(each, axis=axis) for each, axis in ((images, 1), (heights, 0), (widths, 0))
-    )
-    starts = (heights * widths).CumSum(0, exclusive=1)
-    least = heights.Slice([0], [1]).Min(widths.Slice([0], [1]))
-    last = (least.Greater(2 * MIN_SIDE_PX - 1).Cast(to=INT64) + 1) * LAYERS
-    last = least.Greater(4 * MIN_SIDE_PX - 1).Where(OCTAVES * LAYERS, last)
-    count = x.Shape(start=1)
+def directions(levels: Levels, x: Any, y: Any, level: Any) -> Any:
+    """Return the dominant orientations of points, (B, K) degrees, as `candidate_angles` does."""
+    graph, count = x.graph, x.Shape(start=1)
     padding = graph.join([[0, 0, 0], count.Mod(BLOCK) * -1 + BLOCK], axis=0)
-    x, y, sizes = (each.Pad(padding) for each in (x, y, sizes))
+    x, y = (each.Pad(padding) for each in (x, y))
+    level = level.Pad(padding, FIRST)
 
     def turn(number: Any, going: Any) -> tuple[Any, Any]:
         start = number.Reshape([1]) * BLOCK
-        right, below, size = (
+        own = (
             number.graph.tensor(each).Slice(start, start + BLOCK, [1]).Unsqueeze([1, 2, 3])
-            for each in (x, y, sizes)
+            for each in (x, y, level)
         )
-        sides = (number.graph.tensor(each) for each in (flat, starts, heights, widths, last))
-        return going.Identity(), _turn(*sides, right, below, size)
+        return going.Identity(), _turn(levels.at(number.graph), *own)
 
     blocks = (x.Shape(start=1) / BLOCK).Squeeze()
     angles = graph.loop(blocks, turn).Transpose(perm=[1, 0, 2]).Reshape([0, -1])
     return angles.Slice([0], count, [1])
 
 
-def _turn(
-    flat: Any, starts: Any, heights: Any, widths: Any, last: Any, x: Any, y: Any, size: Any
-) -> Any:
-    """Return the orientations (B, K) of points, (B, 1, 1, 1, K), as `strongest_directions` does.
-
-    `flat` contains the layers of an image's SIFT scale space in one row.
-    """
-    graph, reach = flat.graph, np.arange(-REACH - 1, REACH + 2)
-    step = ((size / (SIFT_SIZE_PER_SIGMA * BASE_SIGMA_PX)).Log() * (LAYERS / np.log(2))).Round()
-    layer = step.Clip(1.0, float(OCTAVES * LAYERS)).Cast(to=INT64).Min(last) - 1
-    scale = graph.tensor(2.0 ** np.arange(OCTAVES)).Gather(layer / LAYERS)
-    window = size * (WINDOW_PER_SIGMA / SIFT_SIZE_PER_SIGMA) / scale
-    radius = (window * float(RADIUS_PER_WINDOW)).Round()
-    place, weight = starts.Gather(layer), graph.tensor(1.0)
-    for value, sides, axis, stride in ((y, heights, 0, widths.Gather(layer)), (x, widths, 1, 1)):
-        middle, side = (value / scale).Round().Cast(to=INT64), sides.Gather(layer)
+def _turn(levels: Levels, x: Any, y: Any, level: Any) -> Any:
+    """Return the orientations (B, K) of points, (B, 1, 1, 1, K), as `strongest_directions` does."""
+    coarser = np.clip(np.arange(1, len(OCTAVES) + 1), 0, len(OCTAVES) - 1)
+    pixel, step = 2 ** ANGLE_OCTAVES[coarser], 2 ** (ANGLE_OCTAVES - OCTAVES)[coarser]
+    windows = (WINDOW_PER_LEVEL * SIGMAS_PX / pixel).astype(np.float32)
+    most = int(np.rint(RADIUS_PER_WINDOW * windows[FIRST : LAST + 1]).max())
+    graph, reach = level.graph, np.arange(-most - 1, most + 2)
+    scale, window, step = (
+        graph.tensor(each).Gather(level) for each in (pixel * 1.0, windows, step)
+    )
+    level, radius = level + 1, (window * float(RADIUS_PER_WINDOW)).Round()
+    place, weight = levels.places(level, 0, 0)[0], graph.tensor(1.0)
+    strides = levels.widths.Gather(level) + 2 * MARGIN, 1
+    for value, sides, axis, stride in zip(
+        (y, x), (levels.heights, levels.widths), (0, 1), strides, strict=True
+    ):
+        middle = (value / scale).Round().Cast(to=INT64)
+        side = (sides.Gather(level) + step - 1) / step
         steps = reach.reshape((-1, 1, 1) if axis == 0 else (-1, 1))
         where = middle + steps
-        place = place + where.Max(0).Min(side - 1) * stride
+        place = place + where.Max(0).Min(side - 1) * step * stride
         # The outermost pixels have no gradient.
         near = graph.tensor(np.abs(steps) * 1.0).LessOrEqual(radius)
         near = near.And(where.Greater(0)).And(where.Less(side - 1))
         weight = weight * near.Where(
             ((graph.tensor(steps * 1.0) / window).Pow(2.0) * -0.5).Exp(), 0.0
         )
-    values = flat.GatherElements(place.Reshape([0, -1]), axis=1)
+    values = levels.flat.GatherElements(place.Reshape([0, -1]), axis=1)
     values = values.Reshape([0, 1, len(reach), len(reach), -1])
     dx = _at(values, 1, 0, 1) - _at(values, 1, 0, -1)
     dy = _at(values, 1, 1, 0) - _at(values, 1, -1, 0)

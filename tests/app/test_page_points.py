@@ -15,6 +15,7 @@ from deepdetect import Keypoints, load_image
 from deepdetect.app.server import STATIC
 from deepdetect.detector.points.descriptor import describe_learned
 from deepdetect.detector.points.detection import detect_points, rank_candidates
+from deepdetect.detector.points.hessian_scales import build_scale_space
 from deepdetect.features.learned import RATIOS, match_learned, turn_descriptors
 from deepdetect.features.matchers import exact_neighbours, match_descriptors
 from deepdetect.io.image import luma
@@ -63,7 +64,7 @@ write(values.budgets.flatMap(([count, spread]) => {
 }));
 """
     height, width = gray.shape
-    candidates, logits = rank_candidates(gray)
+    candidates, logits = rank_candidates(build_scale_space(gray))
     columns = np.column_stack([candidates.xy, candidates.sigma_px, logits])
     behind = np.full((5, 4), (0, 0, 0, -np.inf))
     rows = np.concatenate([columns[np.argsort(candidates.rank)], behind]).T.astype(np.float32)

@@ -21,6 +21,7 @@ from deepdetect.app import jobs
 from deepdetect.app.jobs import Job
 from deepdetect.detector.points.descriptor import describe_learned
 from deepdetect.detector.points.detection import detect_points, rank_candidates
+from deepdetect.detector.points.hessian_scales import build_scale_space
 from deepdetect.features.learned import turn_descriptors
 from deepdetect.io.image import luma
 
@@ -122,7 +123,7 @@ def test_the_candidates_are_those_of_the_package(serve: Any, photo: np.ndarray) 
     answer = client.ask("POST", "/api/candidates?width=91&height=100", gray.tobytes())
     assert answer.status == 200
     found = np.frombuffer(answer.content, "<f4").reshape(4, -1)
-    candidates, logits = rank_candidates(gray)
+    candidates, logits = rank_candidates(build_scale_space(gray))
     order = np.argsort(candidates.rank)
     np.testing.assert_array_equal(found[:2].T, candidates.xy[order].astype(np.float32))
     np.testing.assert_array_equal(found[2], candidates.sigma_px[order].astype(np.float32))

@@ -75,6 +75,14 @@ def test_an_opencv_that_hides_another_is_a_problem(
         assert found.remedy.endswith(f"--no-deps {[*packages][-1].replace('_', '-')}")
 
 
+@pytest.mark.slow
+def test_the_benchmark_compares_with_sift(run: Run) -> None:
+    report = json.loads(run("doctor", "--benchmark", "--json").stdout)
+    assert len(report["ratios"]) == 5
+    assert set(report["ratios"]) < set(report)
+    assert min(report["ratios"].values()) > 0
+
+
 def test_no_opencv(run: Run, opencv_of, monkeypatch: pytest.MonkeyPatch) -> None:
     opencv_of(None)
     monkeypatch.setattr(doctor, "CHECKS", (doctor.opencv, doctor.packages))

@@ -173,3 +173,13 @@ def test_upright_descriptors_keep_more_mutual_neighbours_of_upright_images(
         errors = [np.linalg.norm(ends[m.queryIdx] - second.xy[m.trainIdx]) for m in found]
         counts.append(np.count_nonzero(np.array(errors) < 3))
     assert counts[1] > 1.05 * counts[0]
+
+
+def test_a_least_logit_keeps_the_best_of_all(photo: np.ndarray) -> None:
+    everything = PointDetector(None).detect(photo)
+    least = float(np.median(everything.logits))
+    found = PointDetector(None, min_logit=least).detect(photo)
+    np.testing.assert_array_equal(found.xy, everything.xy[everything.logits >= least])
+    assert len(PointDetector(10, min_logit=least).detect(photo)) == 10
+    with pytest.raises(OptionError):
+        PointDetector(min_logit="high")

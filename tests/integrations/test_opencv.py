@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import PointDetector
+from deepdetect import OptionError, PointDetector
 from deepdetect.features.sift import to_root_sift
 from deepdetect.integrations.opencv import DeepDetectFeature2D
 
@@ -93,3 +93,13 @@ def test_nothing_to_detect_is_as_of_opencv() -> None:
     flat = np.full((64, 64), 90, np.uint8)
     assert DeepDetectFeature2D().detectAndCompute(flat, None) == ((), None)
     assert DeepDetectFeature2D().compute(flat, []) == ((), None)
+
+
+def test_by_default_there_are_about_as_many_keypoints_as_of_sift(bgr: np.ndarray) -> None:
+    count, sift = len(DeepDetectFeature2D().detect(bgr)), len(cv2.SIFT_create().detect(bgr))
+    assert sift / 2 < count < 2 * sift
+    assert len(DeepDetectFeature2D(max_keypoints=50).detect(bgr)) == 50
+    few = DeepDetectFeature2D(PointDetector(80), max_keypoints=30)
+    assert len(few.detectAndCompute(bgr)[0]) == 30
+    with pytest.raises(OptionError):
+        DeepDetectFeature2D(max_keypoints=0)

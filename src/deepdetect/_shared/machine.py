@@ -49,7 +49,7 @@ BYTES_PER = {
     "canvas_pixel": 34,
     "blended_pixel": 30,
     # A pixel of a scale-space level: two float32 maps, and arrays derived from them.
-    "pixel_of_level": 16,
+    "pixel_of_level": 12,
     # A pixel of an image in dense matching, and of a depth map in the fusion of depth maps.
     "dense_pixel": 250,
     "fused_pixel": 500,

@@ -37,6 +37,7 @@ from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from ..detector.detector import DeepDetect
 from ..detector.points.descriptor import describe_learned
 from ..detector.points.detection import rank_candidates
+from ..detector.points.hessian_scales import build_scale_space
 from ..features.keypoints import Keypoints
 from ..io.image_file import IMAGE_SUFFIXES
 from .jobs import AppOptions, Jobs
@@ -260,7 +261,7 @@ class AppServer:
         """
 
         def ranked(gray: np.ndarray, _: bytes) -> np.ndarray:
-            candidates, logits = rank_candidates(gray[..., 0])
+            candidates, logits = rank_candidates(build_scale_space(gray[..., 0]))
             columns = np.column_stack([candidates.xy, candidates.sigma_px, logits])
             return columns[np.argsort(candidates.rank)].T
 

@@ -47,6 +47,8 @@ class PointDetector:
         spread: how keypoints are chosen if there are more than `max_keypoints`. "none" takes those
             ranked highest. "grid" takes the best of each cell of a grid, then the second-best of
             each, and so on. "anms" takes good keypoints that are as far apart as possible.
+        min_logit: minimum `Keypoints.logits` of a keypoint. None: no limit. At 7, photographs have
+            about as many keypoints as `cv2.SIFT` finds.
         upright: give all keypoints the angle 0, which keeps more matches of images that are not
             rotated relative to each other. Use this for programs that compare descriptors as they
             are, such as `cv2.BFMatcher`; `match_features` does about as well without it.
@@ -82,6 +84,7 @@ class PointDetector:
         max_keypoints: int | None = 2048,
         *,
         spread: Spread = "none",
+        min_logit: float | None = None,
         upright: bool = False,
         resolution: Literal["auto", "native"] = "auto",
         ranker: str | Path | None = None,
@@ -110,6 +113,8 @@ class PointDetector:
         check_name("resolution of points", resolution, ("auto", "native"))
         self.max_keypoints = None if max_keypoints is None else int(max_keypoints)
         self.spread, self.upright, self.resolution = spread, bool(upright), resolution
+        self.min_logit = min_logit
+        check_ranges(self, between={"min_logit": (-1000, 1000)})
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         self._ranker = load_ranker(self.ranker)
         if isinstance(descriptor, Descriptor):
@@ -130,6 +135,7 @@ class PointDetector:
             "ranker": file_digest(self.ranker),
             "max_keypoints": self.max_keypoints,
             "spread": self.spread,
+            "min_logit": self.min_logit,
             "upright": self.upright,
             "resolution": self.resolution,
         }
@@ -265,7 +271,12 @@ class PointDetector:
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
         with memory_named(gray.shape), limited_threads(self.threads):
             found = detect_points(
-                gray, most, spread=self.spread, ignore=ignore, ranker=self._ranker
+                gray,
+                most,
+                spread=self.spread,
+                ignore=ignore,
+                ranker=self._ranker,
+                min_logit=self.min_logit,
             )
         if self.upright:
             found = replace(found, angles=np.zeros(len(found), np.float32))

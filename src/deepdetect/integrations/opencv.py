@@ -16,8 +16,13 @@ from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.learned import LENGTH
 from ..features.scale_space import packed_octaves
+from ..features.selection import check_max_keypoints
 from ..features.sift import ROOT_SIFT
 from ..io.image import load_image
+
+LEAST_LOGIT = 7.0
+"""Without a limit of their number, keypoints have at least this logit. On photos/val, images then
+have as many keypoints as `cv2.SIFT_create()` finds in them, in the mean of their logarithms."""
 
 
 class DeepDetectFeature2D:
@@ -27,7 +32,9 @@ class DeepDetectFeature2D:
     crash the interpreter. Functions of OpenCV that need a `cv2.Feature2D` therefore reject it.
 
     Args:
-        detector: the detector, which also computes descriptors. Default: `PointDetector()`.
+        detector: the detector, which also computes descriptors. Default: a `PointDetector`.
+        max_keypoints: maximum number of keypoints per image. None: the detector's own or, without a
+            detector, about as many as `cv2.SIFT` finds.
         channels: order of the colours in images: "bgr" as in `cv2.imread`, or "rgb".
 
     Raises:
@@ -44,11 +51,19 @@ class DeepDetectFeature2D:
 
     @suggest_keywords
     def __init__(
-        self, detector: PointDetector | None = None, *, channels: Channels = "bgr"
+        self,
+        detector: PointDetector | None = None,
+        *,
+        max_keypoints: int | None = None,
+        channels: Channels = "bgr",
     ) -> None:
         check_channels(channels)
-        self._channels = channels
-        self._detector = PointDetector() if detector is None else detector
+        check_max_keypoints(max_keypoints)
+        self._channels, self._most = channels, max_keypoints
+        if detector is None:
+            least = LEAST_LOGIT if max_keypoints is None else None
+            detector = PointDetector(max_keypoints, min_logit=least)
+        self._detector = detector
 
     def detect(self, image: Any, mask: np.ndarray | None = None) -> tuple[cv2.KeyPoint, ...]:
         """Detect keypoints.
@@ -65,7 +80,7 @@ class DeepDetectFeature2D:
             ImageError: the image has a wrong shape or type, or is too small.
             OptionError: the mask and the image differ in size.
         """
-        return _to_opencv(self._detector.detect(self._load(image), ignore=_ignored(mask)))
+        return _to_opencv(self._find(self._load(image), mask))
 
     def compute(
         self, image: Any, keypoints: Sequence[cv2.KeyPoint], descriptors: None = None
@@ -102,7 +117,8 @@ class DeepDetectFeature2D:
         """
         if useProvidedKeypoints:
             raise OptionError("`useProvidedKeypoints` is not supported: use the method `compute`")
-        points = self._detector.extract(self._load(image), ignore=_ignored(mask))
+        rgb = self._load(image)
+        points = self._detector.describe(rgb, self._find(rgb, mask))
         return _to_opencv(points), _as_float(points) if len(points) else None
 
     def descriptorSize(self) -> int:
@@ -125,13 +141,13 @@ class DeepDetectFeature2D:
         """Return the name of the algorithm."""
         return "Feature2D.DeepDetect"
 
+    def _find(self, rgb: np.ndarray, mask: np.ndarray | None) -> Keypoints:
+        """Detect keypoints where OpenCV's mask is not 0."""
+        ignore = None if mask is None else np.asarray(mask) == 0
+        return self._detector.detect(rgb, ignore=ignore, max_keypoints=self._most)
+
     def _load(self, image: Any) -> np.ndarray:
         return load_image(image, channels=self._channels)
-
-
-def _ignored(mask: np.ndarray | None) -> np.ndarray | None:
-    """Convert OpenCV's mask, nonzero where keypoints are allowed, to a mask of ignored pixels."""
-    return None if mask is None else np.asarray(mask) == 0
 
 
 def _to_opencv(points: Keypoints) -> tuple[cv2.KeyPoint, ...]:

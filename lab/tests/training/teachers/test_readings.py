@@ -11,6 +11,7 @@ from tests.command_line import run_command
 
 from deepdetect import OptionError
 from deepdetect.detector.points.detection import least_distances, rank_candidates
+from deepdetect.detector.points.hessian_scales import build_scale_space
 from deepdetect.features.selection import suppress_neighbors
 from deepdetect.io.image import find_images, load_image, luma
 from deepdetect_lab.training.teachers import readings
@@ -33,7 +34,7 @@ def test_points_are_strong_and_weak_ones(textures: Path) -> None:
     xy, sizes = choose_points(gray, np.random.default_rng(0))
     assert len(xy) == len(sizes) == POINTS
     assert len(np.unique(xy, axis=0)) == POINTS
-    candidates, logits = rank_candidates(gray)
+    candidates, logits = rank_candidates(build_scale_space(gray))
     order = suppress_neighbors(candidates.xy, logits, least_distances(candidates.sigma_px))
     gaps, ranks = KDTree(candidates.xy[order]).query(xy)
     assert not gaps.any()

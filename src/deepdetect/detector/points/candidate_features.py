@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..._shared.machine import parallel_for
-from .hessian_scales import SIGMAS_PX, VARIANCES, Candidates, ScaleSpace
+from .hessian_scales import OCTAVES, SIGMAS_PX, VARIANCES, Candidates, ScaleSpace
 
 RING_RADII, RING_POINTS = (1.0, 2.0, 3.5, 6.0), 8
 """Radii of the rings of samples around a candidate, in sigmas of its scale, and number of points on
@@ -22,14 +22,14 @@ third to |det Hessian| before its root divides features: all damp noise. Chosen 
 
 
 def ring_offsets() -> np.ndarray:
-    """Return the offsets, in pixels, from a candidate to its P ring points: (2, L, 2, P) int64.
+    """Return the offsets from a candidate to its P ring points, (2, L, 2, P) int64.
 
-    The first axis is x or y. The second is the candidate's level. The third tells whether the
-    candidate's column (for x) or row (for y) is even or odd. The fourth is the ring point: the
-    first points of all rings, then the second points, and so on.
+    They are in pixels of the candidate's level. The first axis is x or y. The second is the level.
+    The third tells whether the candidate's column (for x) or row (for y) is even or odd. The fourth
+    is the ring point: the first points of all rings, then the second points, and so on.
     """
     angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
-    reach = SIGMAS_PX[:, None, None, None] * RING_RADII
+    reach = (SIGMAS_PX / 2.0**OCTAVES)[:, None, None, None] * RING_RADII
     odd = np.arange(2)[:, None, None]  # halves are rounded to even columns and rows
     rings = [np.rint(reach * turn(angle) + odd) - odd for turn in (np.cos, np.sin)]
     return np.array(rings, np.int64).reshape(2, len(SIGMAS_PX), 2, -1)
@@ -54,10 +54,10 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
     pixels = np.stack([candidates.level, candidates.row, candidates.column], 1)
     floors = DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR
     features = np.empty((len(candidates), FEATURES), np.float32)
-    maps = space.smooth.shape, space.smooth.reshape(-1), space.determinant.reshape(-1), VARIANCES
+    maps = space.smooth, space.response, space.layout, OCTAVES, VARIANCES
     given = *maps, ring_offsets(), pixels, floors, features
     parallel_for(len(candidates), measure_candidates, *given)
     features[:, 17] += 2 * space.gray - 1
-    features[:, -2] = np.log((candidates.rank + 1) / space.smooth[0].size) / 2 + 3
+    features[:, -2] = np.log((candidates.rank + 1) / space.layout[0, 1:].prod()) / 2 + 3
     features[:, -1] = (candidates.level - 4) / 3
     return features

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..._shared.machine import require_memory
 from ...features.keypoints import Keypoints
-from ...features.scale_space import dominant_angles
+from ...features.scale_space import SIZE_PER_SIGMA as SIFT_SIZE_PER_SIGMA
+from ...features.scale_space import WINDOW_PER_SIGMA
 from ...features.selection import (
     check_ignore,
     spread_by_distance,
@@ -16,7 +17,15 @@ from ...features.selection import (
     suppress_neighbors,
 )
 from .candidate_features import describe_candidates
-from .hessian_scales import SIGMAS_PX, Candidates, build_scale_space, find_candidates
+from .hessian_scales import (
+    ANGLE_OCTAVES,
+    OCTAVES,
+    SIGMAS_PX,
+    Candidates,
+    ScaleSpace,
+    build_scale_space,
+    find_candidates,
+)
 from .ranker import Ranker, load_ranker
 
 Spread = Literal["none", "grid", "anms"]
@@ -42,6 +51,9 @@ score (mostly repeatability) from 0.539 to 0.543; 1.5 or 2.3 for 2 px changed it
 SIZE_PER_SIGMA = 2.5
 """Diameter at which a keypoint is described, divided by the sigma of its scale. Chosen by hand."""
 
+WINDOW_PER_LEVEL = WINDOW_PER_SIGMA * SIZE_PER_SIGMA / SIFT_SIZE_PER_SIGMA
+"""Sigma of the window for an orientation, as in SIFT, divided by the sigma of the point's level."""
+
 
 def least_distances(sigma_px: np.ndarray) -> np.ndarray:
     """Return, for (N,) sigmas, the minimum distances to keypoints of the same or a larger sigma."""
@@ -55,16 +67,29 @@ def detect_points(
     spread: Spread = "none",
     ignore: np.ndarray | None = None,
     ranker: Ranker | None = None,
+    min_logit: float | None = None,
 ) -> Keypoints:
     """Detect keypoints of all scales in a (H, W) uint8 image, best first, as `PointDetector` does.
 
     The logits come from the ranker. `ranking_scores` turns the logits into scores.
     """
+    height, width = gray.shape
+    require_memory(
+        f"points of an image of {width}x{height} pixels",
+        "use `resolution='auto'`, or a smaller image",
+        pixel_of_level=gray.size * np.sum(0.25**OCTAVES),
+    )
+    if ignore is not None:
+        ignore = check_ignore(ignore, gray.shape)
     # Spreading needs all candidates: in regions of low contrast, none are among the strongest.
     limit = max_keypoints if spread == "none" else None
     strongest = None if limit is None else max(CANDIDATES_PER_KEYPOINT * limit, MIN_CANDIDATES)
-    candidates, logits = rank_candidates(gray, strongest, ignore=ignore, ranker=ranker)
-    size = gray.shape[1], gray.shape[0]
+    space = build_scale_space(gray)
+    candidates, logits = rank_candidates(space, strongest, ignore=ignore, ranker=ranker)
+    if min_logit is not None:
+        some = logits >= min_logit
+        candidates, logits = candidates[some], logits[some]
+    size = width, height
     if not len(candidates):
         none = np.empty(0, np.float32)
         return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none, angles=none)
@@ -77,37 +102,45 @@ def detect_points(
         else:
             chosen = spread_by_distance(*found, max_keypoints)
         kept = kept[np.sort(chosen)]  # best first, as before
-    xy, sizes = candidates.xy[kept], SIZE_PER_SIGMA * candidates.sigma_px[kept]
-    angles = dominant_angles(gray, xy, sizes)
-    scores = ranking_scores(logits[kept])
-    return Keypoints(xy, scores, size, logits=logits[kept], sizes=sizes, angles=angles)
+    chosen, logits = candidates[kept], logits[kept]
+    sizes = SIZE_PER_SIGMA * chosen.sigma_px
+    angles = candidate_angles(space, chosen)
+    scores = ranking_scores(logits)
+    return Keypoints(chosen.xy, scores, size, logits=logits, sizes=sizes, angles=angles)
 
 
 def rank_candidates(
-    gray: np.ndarray,
+    space: ScaleSpace,
     strongest: int | None = None,
     *,
     ignore: np.ndarray | None = None,
     ranker: Ranker | None = None,
 ) -> tuple[Candidates, np.ndarray]:
-    """Return the `strongest` candidates (None: all) of a (H, W) uint8 image, and their logits."""
-    height, width = gray.shape
-    require_memory(
-        f"points of an image of {width}x{height} pixels",
-        "use `resolution='auto'`, or a smaller image",
-        pixel_of_level=gray.size * len(SIGMAS_PX),
-    )
-    space = build_scale_space(gray)
-    candidates = find_candidates(space)
-    rows = np.argsort(candidates.rank)
-    if ignore is not None:
-        wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
-        rows = rows[wanted[rows]]
-    rows = rows[:strongest]
+    """Return the `strongest` candidates (None: all) outside `ignore`, and their logits."""
+    candidates = find_candidates(space, strongest, ignore)
     # In the order of tiles, successive candidates of all scales use the same cached pixels.
-    tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
-    candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
+    row, column = (pixels // TILE_PX for pixels in candidates.pixels)
+    candidates = candidates[np.argsort(((row << 8) + column).astype(np.uint16), kind="stable")]
     return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))
+
+
+def candidate_angles(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
+    """Return the dominant orientations of candidates, (N,) float32 degrees, as SIFT's.
+
+    Gradients are those of the next coarser level than the candidate's own.
+    """
+    from ...features.kernels import strongest_directions
+
+    angles = np.empty(len(candidates), np.float32)
+    for level in np.unique(candidates.level):
+        own, next_level = candidates.level == level, level + 1
+        octave = ANGLE_OCTAVES[next_level]
+        step, pixel = 1 << (octave - OCTAVES[next_level]), 2.0**octave
+        image = np.ascontiguousarray(space.level(space.smooth, next_level)[::step, ::step])
+        pixels = np.rint(candidates.xy[own] / pixel).astype(np.int64)
+        windows = np.full(len(pixels), WINDOW_PER_LEVEL * SIGMAS_PX[level] / pixel)
+        angles[own] = strongest_directions(image, pixels, windows)
+    return angles
 
 
 def ranking_scores(logits: np.ndarray) -> np.ndarray:

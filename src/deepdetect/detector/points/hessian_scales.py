@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..._shared.opencv import cv2
-from ...features.selection import descending_order, peak_offset
+from ...features.selection import MAX_OFFSET_PX, descending_order
 
 NMS_RADIUS = 2
 """A candidate has the highest |det Hessian| within this many pixels in x and y. Chosen by hand."""
@@ -16,8 +16,16 @@ SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
 """Sigmas of the Gaussians of all levels, in pixels, from fine to coarse. Seven levels have
 candidates. The finest and the two coarsest only serve the ranker's features. Chosen by hand."""
 
-VARIANCES = (SIGMAS_PX**2).astype(np.float32)
-"""Squares of `SIGMAS_PX`, which normalise the derivatives."""
+OCTAVES = np.log2(SIGMAS_PX / 3).clip(0).astype(np.int64)
+"""A level of octave o has every 2^o-th pixel of every 2^o-th row, which saves time. Its sigma is at
+least 3 of these pixels: on pairs made of photos/val, the mean repeatability of 2,048 keypoints
+within 3 px is then 0.716, with at least 2 pixels 0.713, and with all pixels 0.717."""
+
+ANGLE_OCTAVES = np.log2(SIGMAS_PX / 2).clip(0).astype(np.int64)
+"""For orientations, which need less detail, only every 2^o-th pixel of the image is read."""
+
+VARIANCES = ((SIGMAS_PX / 2.0**OCTAVES) ** 2).astype(np.float32)
+"""Squares of the sigmas in pixels of their levels, which normalise the derivatives."""
 
 LEAST_RESPONSE = 1e-8
 """Minimum |det Hessian| of a candidate, for grey values in [0, 1]: less is rounding error."""
@@ -25,15 +33,24 @@ LEAST_RESPONSE = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class ScaleSpace:
-    """Smoothed copies of an image with values in [0, 1], and the determinants of their Hessians.
+    """Smoothed copies of an image with values in [0, 1], and |det Hessian| of each.
 
-    `gray` is the mean of the image, rounded to a multiple of 1/255. `smooth` holds the copies minus
-    `gray`, and `determinant` the scale-normalised determinants. Both are (L, H, W) float32.
+    Attributes:
+        gray: mean of the image, rounded to a multiple of 1/255.
+        smooth: float32 copies minus `gray`; all levels, one after the other.
+        response: float32 scale-normalised |det Hessian| of the same pixels.
+        layout: (L, 3) int64, for each level its first index in both arrays, its height and width.
     """
 
     gray: np.float32
     smooth: np.ndarray
-    determinant: np.ndarray
+    response: np.ndarray
+    layout: np.ndarray
+
+    def level(self, values: np.ndarray, number: int) -> np.ndarray:
+        """Return a level of `smooth` or `response` as an image, (height, width)."""
+        start, height, width = self.layout[number].tolist()
+        return values[start : start + height * width].reshape(height, width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +58,7 @@ class Candidates:
     """Maxima of |det Hessian| in each level of a scale space.
 
     Attributes:
-        level, row, column: (N,) int64 level of the scale space, and pixel in it.
+        level, row, column: (N,) int64 level of the scale space, and pixel of that level.
         xy: (N, 2) float64 sub-pixel positions in the image.
         sigma_px: (N,) float64 sigmas of the candidates' levels.
         rank: (N,) int64 ranks by scale-normalised |det Hessian|; 0 is the strongest of all levels.
@@ -57,6 +74,11 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.level)
 
+    @property
+    def pixels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the candidates' pixels in the image."""
+        return self.row << OCTAVES[self.level], self.column << OCTAVES[self.level]
+
     def __getitem__(self, rows: np.ndarray) -> Candidates:
         """Return the candidates chosen by a mask or by row indices."""
         return Candidates(*(getattr(self, field.name)[rows] for field in fields(self)))
@@ -66,39 +88,58 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     """Smooth a (H, W) uint8 image with all sigmas, and compute the determinants of the Hessian."""
     from .kernels import differentiate
 
-    smooth, determinant = (np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(2))
+    sides = -(-np.array(gray.shape) // (1 << OCTAVES[:, None]))
+    ends = np.cumsum(sides.prod(axis=1))
+    layout = np.column_stack([ends - sides.prod(axis=1), sides])
+    smooth, response = (np.empty(ends[-1], np.float32) for _ in range(2))
     # Subtracting the mean brings values close to 0, where float32 rounds least. With less rounding,
     # other implementations, such as the ONNX graph, find the same maxima.
     mean = np.float32(np.rint(gray.mean()))
-    space = ScaleSpace(mean / np.float32(255), smooth, determinant)
-    current, reached = (gray - mean) / np.float32(255), 0.0
+    space = ScaleSpace(mean / np.float32(255), smooth, response, layout)
+    current, octave, reached = (gray - mean) / np.float32(255), 0, 0.0
     for k, sigma in enumerate(SIGMAS_PX):
+        if OCTAVES[k] > octave:
+            current, octave = np.ascontiguousarray(current[::2, ::2]), OCTAVES[k]
         # The variances of Gaussians add up: each level smooths the previous one.
-        step = float(np.sqrt(sigma**2 - reached**2))
-        current, reached = cv2.GaussianBlur(current, (0, 0), step, dst=smooth[k]), sigma
-        differentiate(smooth[k], VARIANCES[k], determinant[k])
+        step = float(np.sqrt(sigma**2 - reached**2)) / 2.0**octave
+        out = space.level(smooth, k)
+        current, reached = cv2.GaussianBlur(current, (0, 0), step, dst=out), sigma
+        differentiate(current, VARIANCES[k], space.level(response, k))
     return space
 
 
-def find_candidates(space: ScaleSpace) -> Candidates:
-    """Find the maxima of |det Hessian| in each level except the finest and the two coarsest.
+def find_candidates(
+    space: ScaleSpace, strongest: int | None = None, ignore: np.ndarray | None = None
+) -> Candidates:
+    """Find maxima of |det Hessian| in each level except the finest and the two coarsest.
 
-    Positions are refined by parabolas in x and y. The outermost pixels are not searched.
+    Positions are refined by paraboloids. The outermost pixels are not searched. Returns
+    the `strongest` candidates (None: all) outside `ignore`, (H, W) bool, the strongest first.
     """
-    pixels, positions, strengths = [], [], []
-    window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)
-    for k in range(1, len(SIGMAS_PX) - 2):
-        response = np.abs(space.determinant[k])
-        peak = (response == cv2.dilate(response, window)) & (response > LEAST_RESPONSE)
-        row, column = np.add(np.divmod(np.flatnonzero(peak[1:-1, 1:-1]), response.shape[1] - 2), 1)
-        x = column + peak_offset(response, row, column, axis=1)
-        y = row + peak_offset(response, row, column, axis=0)
-        pixels.append(np.stack([np.full(len(row), k), row, column]))
-        positions.append(np.stack([x, y], 1))
-        strengths.append(response[row, column])
-    level, row, column = np.concatenate(pixels, 1)
-    strength = np.concatenate(strengths)
-    rank = np.empty(len(level), np.int64)
-    rank[descending_order(strength)] = np.arange(len(level))
-    xy = np.concatenate(positions)
-    return Candidates(level, row, column, xy, SIGMAS_PX[level], rank)
+    from .kernels import mark_peaks, refine_peaks
+
+    levels, starts, widths = range(1, len(SIGMAS_PX) - 2), space.layout[:, 0], space.layout[:, 2]
+    found = []
+    for k in levels:
+        response = space.level(space.response, k)
+        peak = np.zeros(response.shape, np.bool_)
+        mark_peaks(response, np.float32(LEAST_RESPONSE), peak)
+        found.append(np.flatnonzero(peak))
+    level = np.repeat(levels, [len(each) for each in found])
+    place = np.concatenate(found)
+    if ignore is not None:
+        row, column = np.divmod(place, widths[level])
+        seen = ~ignore[row << OCTAVES[level], column << OCTAVES[level]]
+        level, place = level[seen], place[seen]
+    strength = space.response[starts[level] + place]
+    if strongest is not None and len(place) > strongest:
+        least = np.partition(strength, -strongest)[-strongest]
+        some = strength >= least
+        level, place, strength = level[some], place[some], strength[some]
+    order = descending_order(strength)[:strongest]
+    level, place = level[order], place[order]
+    row, column = np.divmod(place, widths[level])
+    pixels = np.column_stack([level, row, column])
+    xy = np.empty((len(order), 2))
+    refine_peaks(pixels, space.response, space.layout, OCTAVES, MAX_OFFSET_PX, xy)
+    return Candidates(level, row, column, xy, SIGMAS_PX[level], np.arange(len(order)))

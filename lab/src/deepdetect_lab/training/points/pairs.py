@@ -72,7 +72,7 @@ def candidate_pair(pair: ViewPair, density: float) -> CandidatePair:
         space = build_scale_space(image)
         candidates = find_candidates(space)
         features = describe_candidates(space, candidates)
-        rows = np.flatnonzero(valid[candidates.row, candidates.column])
+        rows = np.flatnonzero(valid[candidates.pixels])
         strongest = np.argsort(-features[rows, 0], kind="stable")[:MAX_CANDIDATES]
         rows = rows[np.sort(strongest)]
         sides.append((candidates.xy[rows], candidates.sigma_px[rows], features[rows]))

@@ -17,6 +17,7 @@ from deepdetect._shared.opencv import cv2
 from deepdetect._shared.progress import progress
 from deepdetect._shared.runtimes import start_session
 from deepdetect.detector.points.detection import SIZE_PER_SIGMA, least_distances, rank_candidates
+from deepdetect.detector.points.hessian_scales import build_scale_space
 from deepdetect.features.selection import suppress_neighbors
 from deepdetect.io.image import load_image, luma
 
@@ -133,7 +134,7 @@ class Teachers:
 
 def choose_points(gray: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Choose strong and weak keypoints at random, best first; return their positions and sizes."""
-    candidates, logits = rank_candidates(gray)
+    candidates, logits = rank_candidates(build_scale_space(gray))
     kept = suppress_neighbors(candidates.xy, logits, least_distances(candidates.sigma_px))
     best = min(len(kept), round(STRONG_DENSITY * gray.size))
     strong = rng.permutation(best)[: round(POINTS * STRONG_SHARE)]

@@ -1,5 +1,5 @@
 // Dominant orientation of the gradients around keypoints (Lowe, 2004, Section 5), as in
-// `deepdetect.features.scale_space`.
+// `deepdetect.detector.points.detection`.
 import { SIZE_PER_SIGMA, layersOf } from "./scale_space.js";
 import { roundHalfEven } from "./selection.js";
 
@@ -28,7 +28,7 @@ function degrees(y, x) {
 
 /**
  * @param {Uint8Array} gray
- * @param {{xy: Float32Array, sizes: Float32Array}} keypoints sizes are twice sigma
+ * @param {{xy: Float32Array, sizes: Float32Array}} points sizes are those of the levels of points
  * @returns {Float32Array} degrees in [0, 360), from x towards y, which points down
  */
 export function dominantAngles(gray, width, height, { xy, sizes }) {

@@ -1,46 +1,46 @@
-// SIFT's Gaussian scale space, as in `deepdetect.features.scale_space`, and the layers of keypoints.
+// Gaussian scale spaces: SIFT's constants, and the levels of points, as in `deepdetect.detector.points`.
 import { blur } from "./gaussian.js";
-import { roundHalfEven } from "./selection.js";
 
 export const LAYERS = 3; // layers of an octave that can have keypoints
 export const BASE_SIGMA_PX = 1.6;
 export const CAMERA_SIGMA_PX = 0.5; // assumed blur of an image
 export const SIZE_PER_SIGMA = 2;
-const MIN_SIDE_PX = 8;
-
-/** Returns the layer whose sigma is nearest to that of a keypoint, counted from octave 0. */
-function nearestLayer(size, width, height) {
-  const step = roundHalfEven(LAYERS * Math.log2(size / SIZE_PER_SIGMA / BASE_SIGMA_PX));
-  const lastOctave = Math.max(0, Math.floor(Math.log2(Math.min(width, height) / MIN_SIDE_PX)));
-  return Math.max(1, Math.min(LAYERS * (lastOctave + 1), step));
-}
+const POINT_SIZE_PER_SIGMA = 2.5;
+const FACTOR = 1.35; // of the sigmas of successive levels
+const SIGMAS_PX = Array.from({ length: 10 }, (_, k) => 1.5 * FACTOR ** (k - 1));
 
 /**
- * Yields, from fine to coarse, the layers of the scale space that are nearest to the sizes of keypoints.
+ * Yields, from fine to coarse, the levels of the scale space in which the orientations of points are found:
+ * the next coarser ones than their own.
  *
  * @param {Uint8Array} gray @param {ArrayLike<number>} sizes diameters in pixels
  * @yields {{image: Float32Array, width: number, height: number, scale: number, rows: number[]}} the
- *   pixel (x, y) is at (x, y) * scale in the input; rows are those of its keypoints
+ *   pixel (x, y) is at (x, y) * scale in the input; rows are those of its points
  */
 export function* layersOf(gray, width, height, sizes) {
-  const rows = new Map(); // rows of keypoints by layer
+  const rows = new Map(); // rows of points by level
   for (let row = 0; row < sizes.length; row++) {
-    const layer = nearestLayer(sizes[row], width, height);
-    if (!rows.has(layer)) rows.set(layer, []);
-    rows.get(layer).push(row);
+    const sigma = sizes[row] / POINT_SIZE_PER_SIGMA;
+    const level = Math.round(Math.log(sigma / SIGMAS_PX[0]) / Math.log(FACTOR)) + 1;
+    if (!rows.has(level)) rows.set(level, []);
+    rows.get(level).push(row);
   }
   const last = Math.max(...rows.keys());
-  let [image, sigma, scale] = [Float32Array.from(gray), CAMERA_SIGMA_PX, 1];
-  for (let octave = 0; LAYERS * octave < last; octave++) {
-    for (let layer = 0; layer <= LAYERS; layer++) {
-      const wanted = BASE_SIGMA_PX * 2 ** (layer / LAYERS);
-      if (wanted > sigma) image = blur(image, width, height, Math.sqrt(wanted ** 2 - sigma ** 2));
-      sigma = wanted;
-      const found = layer > 0 ? rows.get(LAYERS * octave + layer) : undefined;
-      if (found) yield { image, width, height, scale, rows: found };
+  let [image, reached, scale] = [Float32Array.from(gray), 0, 1];
+  for (let level = 0; level <= last; level++) {
+    if (SIGMAS_PX[level] >= 6 * scale) {
+      [image, width, height] = halved(image, width, height);
+      scale *= 2;
     }
-    [image, width, height] = halved(image, width, height);
-    [sigma, scale] = [BASE_SIGMA_PX, 2 * scale];
+    image = blur(image, width, height, Math.sqrt(SIGMAS_PX[level] ** 2 - reached ** 2) / scale);
+    reached = SIGMAS_PX[level];
+    if (!rows.has(level)) continue;
+    const own = { image, width, height, scale, rows: rows.get(level) };
+    if (reached >= 4 * scale) {
+      [own.image, own.width, own.height] = halved(image, width, height);
+      own.scale = 2 * scale;
+    }
+    yield own;
   }
 }
 
