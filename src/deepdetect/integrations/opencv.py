@@ -13,16 +13,13 @@ from .._shared.image_array import Channels, check_channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
+from ..detector.points.ranker import LOGIT_AS_SIFT
 from ..features.keypoints import Keypoints
 from ..features.learned import LENGTH
 from ..features.scale_space import packed_octaves
 from ..features.selection import check_max_keypoints
 from ..features.sift import ROOT_SIFT
 from ..io.image import load_image
-
-LEAST_LOGIT = 7.0
-"""Without a limit of their number, keypoints have at least this logit. On photos/val, images then
-have as many keypoints as `cv2.SIFT_create()` finds in them, in the mean of their logarithms."""
 
 
 class DeepDetectFeature2D:
@@ -61,7 +58,7 @@ class DeepDetectFeature2D:
         check_max_keypoints(max_keypoints)
         self._channels, self._most = channels, max_keypoints
         if detector is None:
-            least = LEAST_LOGIT if max_keypoints is None else None
+            least = LOGIT_AS_SIFT if max_keypoints is None else None
             detector = PointDetector(max_keypoints, min_logit=least)
         self._detector = detector
 
