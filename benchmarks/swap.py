@@ -3,11 +3,11 @@
     python benchmarks/swap.py DATA
 
 DATA contains the folders fountain and entry. All pairs of images up to 4 apart are matched with
-`crossCheck`. A match is right if its Sampson distance from the epipolar lines is below 1.5 px.
+`crossCheck`. A match is correct if its Sampson distance from the epipolar lines is below 1.5 px.
 
 - limit: at most so many keypoints per image, for both methods; none: the methods' own defaults.
-- SIFT, ours: number of right matches of all pairs. ratio, least: their ratio, and that of the worst
-  pair. keypoints: mean number of ours, divided by SIFT's.
+- SIFT, ours: number of correct matches of all pairs. ratio, least: their ratio, and that of the
+  worst pair. keypoints: mean number of ours, divided by SIFT's.
 - time: median processor time of `detectAndCompute` per image, divided by SIFT's.
 """
 
@@ -25,7 +25,7 @@ from deepdetect.integrations.opencv import DeepDetectFeature2D
 from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect_lab.evaluation.report import Row, Table
 
-SCENES, APART, RIGHT_PX, LIMITS = ("fountain", "entry"), 4, 1.5, (None, 2048)
+SCENES, APART, CORRECT_PX, LIMITS = ("fountain", "entry"), 4, 1.5, (None, 2048)
 """The text at the top explains these numbers. Chosen by hand."""
 
 
@@ -45,7 +45,7 @@ def compare(data: Path, limit: int | None) -> Row:
     """Match all pairs with SIFT and with our points; return a row."""
     ours = DeepDetectFeature2D(max_keypoints=limit)
     methods = cv2.SIFT_create(0 if limit is None else limit), ours
-    right: list[tuple[int, int]] = []
+    correct: list[tuple[int, int]] = []
     counts, seconds = [], []
     for scene in (s for name in SCENES for s in load_posed_scenes(data / name)):
         described = []
@@ -70,13 +70,13 @@ def compare(data: Path, limit: int | None) -> Row:
                 matches = matcher.match(codes0, codes1)
                 rows = np.array([(each.queryIdx, each.trainIdx) for each in matches]).T
                 errors = epipolar_errors(xy0[rows[0]], xy1[rows[1]], pair.fundamental)
-                numbers.append(int((errors < RIGHT_PX).sum()))
-            right.append((numbers[0], numbers[1]))
-    sums, share = np.sum(right, axis=0), np.divide(*np.transpose(right)[::-1])
+                numbers.append(int((errors < CORRECT_PX).sum()))
+            correct.append((numbers[0], numbers[1]))
+    sums, share = np.sum(correct, axis=0), np.divide(*np.transpose(correct)[::-1])
     times = np.median(np.divide(*np.transpose(seconds)[::-1]))
     keypoints = np.divide(*np.mean(counts, axis=0)[::-1])
     return {
-        **{"limit": "none" if limit is None else f"{limit:,}", "pairs": len(right)},
+        **{"limit": "none" if limit is None else f"{limit:,}", "pairs": len(correct)},
         **{"SIFT": int(sums[0]), "ours": int(sums[1]), "ratio": float(sums[1] / sums[0])},
         **{"least": float(share.min()), "keypoints": float(keypoints), "time": float(times)},
     }

@@ -22,7 +22,7 @@ least 3 of these pixels: on pairs made of photos/val, the mean repeatability of 
 within 3 px is then 0.716, with at least 2 pixels 0.713, and with all pixels 0.717."""
 
 ANGLE_OCTAVES = np.log2(SIGMAS_PX / 2).clip(0).astype(np.int64)
-"""For orientations, which need less detail, only every 2^o-th pixel of the image is read."""
+"""Orientations, which need less detail, are found from every 2^o-th pixel of the image."""
 
 VARIANCES = ((SIGMAS_PX / 2.0**OCTAVES) ** 2).astype(np.float32)
 """Squares of the sigmas in pixels of their levels, which normalise the derivatives."""
