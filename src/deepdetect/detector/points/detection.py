@@ -102,11 +102,10 @@ def detect_points(
         else:
             chosen = spread_by_distance(*found, max_keypoints)
         kept = kept[np.sort(chosen)]  # best first, as before
-    chosen, logits = candidates[kept], logits[kept]
-    sizes = SIZE_PER_SIGMA * chosen.sigma_px
-    angles = candidate_angles(space, chosen)
+    candidates, logits = candidates[kept], logits[kept]
+    sizes, angles = SIZE_PER_SIGMA * candidates.sigma_px, candidate_angles(space, candidates)
     scores = ranking_scores(logits)
-    return Keypoints(chosen.xy, scores, size, logits=logits, sizes=sizes, angles=angles)
+    return Keypoints(candidates.xy, scores, size, logits=logits, sizes=sizes, angles=angles)
 
 
 def rank_candidates(
@@ -133,10 +132,9 @@ def candidate_angles(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
 
     angles = np.empty(len(candidates), np.float32)
     for level in np.unique(candidates.level):
-        own, next_level = candidates.level == level, level + 1
-        octave = ANGLE_OCTAVES[next_level]
-        step, pixel = 1 << (octave - OCTAVES[next_level]), 2.0**octave
-        image = np.ascontiguousarray(space.level(space.smooth, next_level)[::step, ::step])
+        own, coarser = candidates.level == level, level + 1
+        step, pixel = 2 ** (ANGLE_OCTAVES - OCTAVES)[coarser], 2.0 ** ANGLE_OCTAVES[coarser]
+        image = np.ascontiguousarray(space.level(space.smooth, coarser)[::step, ::step])
         pixels = np.rint(candidates.xy[own] / pixel).astype(np.int64)
         windows = np.full(len(pixels), WINDOW_PER_LEVEL * SIGMAS_PX[level] / pixel)
         angles[own] = strongest_directions(image, pixels, windows)
