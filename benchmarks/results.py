@@ -82,6 +82,7 @@ STAGES = {
     "scale": "benchmarks/scale.py {data}/photos --work {output}",
     "match-filter": "benchmarks/match_filter.py {data}",
     "exact-matches": "benchmarks/exact_matches.py {data}",
+    "swap": "benchmarks/swap.py {data}",
     "modalities": f"benchmarks/modalities.py {{data}}/multimodal{XFEAT}{E64}",
     "made-scenes": "benchmarks/made_scenes.py {data} --scenes {output}/scenes",
 }
@@ -298,6 +299,7 @@ RESULTS = {
     "scale": Result("scale", "0"),
     "match-filter": Result("match-filter", "0"),
     "exact-matches": Result("exact-matches", "0"),
+    "swap": Result("swap", "0"),
     "modalities": Result("modalities", "0"),
     "made-scenes": Result("made-scenes", "0"),
     "foreground": Result(
