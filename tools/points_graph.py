@@ -43,7 +43,7 @@ from deepdetect.detector.points.detection import (
 from deepdetect.detector.points.hessian_scales import (
     ANGLE_OCTAVES,
     LEAST_RESPONSE,
-    NMS_RADIUS,
+    NMS_RADII,
     OCTAVES,
     SIGMAS_PX,
     VARIANCES,
@@ -66,7 +66,7 @@ REACH_PER_SIGMA = 4
 FIRST, LAST = 1, len(SIGMAS_PX) - 3
 """First and last level that has candidates."""
 
-MARGIN = NMS_RADIUS + 1
+MARGIN = int(NMS_RADII.max()) + 1
 """Radius of the patch around a candidate that is read: a window and one pixel for derivatives."""
 
 NEAR, OTHERS = np.arange(-1, 3), [0, 2, 3]
@@ -312,7 +312,8 @@ def _peaks(levels: Levels, k: int) -> Any:
         inner.append(place.Greater(0).And(place.Less(side - 1)))
     inside = inner[0].Unsqueeze([1]).And(inner[1])
     response = _determinant(frame, MARGIN, VARIANCES[k]).Abs()
-    window = {"kernel_shape": [2 * NMS_RADIUS + 1] * 2, "pads": [NMS_RADIUS] * 4}
+    radius = int(NMS_RADII[k])
+    window = {"kernel_shape": [2 * radius + 1] * 2, "pads": [radius] * 4}
     peak = response.Equal(response.MaxPool(**window)).And(inside)
     return peak.And(response.Greater(LEAST_RESPONSE)).Where(response, 0.0).Flatten()
 
@@ -498,7 +499,7 @@ def _log_slope(values: Any, margin: int, variance: Any) -> Any:
 
 def _peak_offsets(response: Any) -> list[Any]:
     """Return the offsets in x and y of maxima from the centres of windows, as `refine_peaks`."""
-    near = [[_at(response, NMS_RADIUS, j, i) for i in (-1, 0, 1)] for j in (-1, 0, 1)]
+    near = [[_at(response, MARGIN - 1, j, i) for i in (-1, 0, 1)] for j in (-1, 0, 1)]
     dx, dy = (near[1][2] - near[1][0]) * 0.5, (near[2][1] - near[0][1]) * 0.5
     xx = (near[1][0] - near[1][1]) + (near[1][2] - near[1][1])
     yy = (near[0][1] - near[1][1]) + (near[2][1] - near[1][1])

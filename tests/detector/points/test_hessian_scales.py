@@ -50,7 +50,7 @@ def test_candidates_are_the_maxima_of_their_windows() -> None:
     strengths = np.empty(len(candidates), np.float32)
     for k in range(1, len(SIGMAS_PX) - 2):
         response = space.level(space.response, k)
-        peak = response == cv2.dilate(response, np.ones((5, 5), np.uint8))
+        peak = response == cv2.dilate(response, np.ones([3 if OCTAVES[k] else 5] * 2, np.uint8))
         own = candidates.level == k
         pixel = candidates.row[own], candidates.column[own]
         expected = np.argwhere(peak[1:-1, 1:-1]) + 1

@@ -43,34 +43,32 @@ def differentiate(smooth, variance, response):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, error_model="numpy")
-def mark_peaks(response, least, peak):  # type: ignore[no-untyped-def]
-    """Mark, in `peak`, the maxima of 5x5 pixels of (H, W) values above `least`.
+def mark_peaks(response, radius, least, peak):  # type: ignore[no-untyped-def]
+    """Mark, in `peak`, the (H, W) values above `least` that are maxima within `radius` pixels.
 
     The outermost pixels are not marked.
     """
     height, width = response.shape
-    across, highest = np.zeros((5, width), np.float32), np.empty(width, np.float32)
-    for row in range(height + 1):
+    rows = 2 * radius + 1
+    across, highest = np.zeros((rows, width), np.float32), np.empty(width, np.float32)
+    for row in range(height + radius):
+        out = across[row % rows]
         if row < height:
-            here, out = response[row], across[row % 5]
-            near1, near2, near3, near4 = here[1:], here[2:], here[3:], here[4:]
-            inner = out[2:]
-            for x in range(width - 4):
-                most = max(max(here[x], near1[x]), max(near2[x], near3[x]))
-                inner[x] = max(most, near4[x])
-            for x in range(width):
-                if 2 <= x < width - 2:
-                    continue
-                out[x] = here[max(x - 2, 0) : x + 3].max()
+            out[:] = response[row]
+            for step in range(1, radius + 1):
+                for x in range(width - step):
+                    out[x] = max(out[x], response[row, x + step])
+                for x in range(step, width):
+                    out[x] = max(out[x], response[row, x - step])
         else:
-            across[row % 5] = 0
-        middle = row - 2
-        if middle < 1:
+            out[:] = 0
+        middle = row - radius
+        if middle < 1 or middle >= height - 1:
             continue
-        first, second, third, fourth, fifth = across
-        for x in range(width):
-            most = max(max(first[x], second[x]), max(third[x], fourth[x]))
-            highest[x] = max(most, fifth[x])
+        highest[:] = across[0]
+        for other in range(1, rows):
+            for x in range(width):
+                highest[x] = max(highest[x], across[other, x])
         own, marks = response[middle], peak[middle]
         for x in range(1, width - 1):
             marks[x] = (own[x] == highest[x]) & (own[x] > least)

@@ -2,8 +2,8 @@
 
 The second image is warped by the homography of a plane. Corners and tentative matches are tracked
 from the first image to the warped one. A homography is fitted to the largest set of tracks on one
-plane. It is kept if homographies fitted to the black and to the white squares of a chessboard fit,
-each in the squares of the other colour, together no fewer tracks than the initial homography.
+plane. It is kept if homographies fitted to the black and to the white squares of a chessboard have,
+each in the squares of the other colour, no larger errors than the initial homography.
 
 In a static scene, parallax displaces points off the plane along lines through the epipole (Chum,
 Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane", 2005). Lens
@@ -109,13 +109,13 @@ class PlaneTracks:
         """Return whether fits to squares of either colour hold in those of the other colour."""
         starts, ends = self._starts, self._ends
         black = (starts // (self._side / SQUARES)).sum(axis=1) % 2 == 1
-        gain = -np.count_nonzero(_on_plane(starts, ends))
+        predicted = np.empty_like(starts)
         for used in (black, ~black):
             found = _fitted(starts[used], ends[used], NOISE_PX)
             if found is None:
                 return False
-            gain += np.count_nonzero(_on_plane(transform_points(starts, found), ends) & ~used)
-        return bool(gain >= 0)
+            predicted[~used] = transform_points(starts[~used], found)
+        return bool(_misfit(predicted, ends) <= _misfit(starts, ends))
 
     def show_depth(self, foreground: bool = False, seed: int = 0) -> bool:
         """Return whether the scene has depth or, if `foreground`, an object far from its plane."""
@@ -155,8 +155,9 @@ def match_along_plane(
     return GuidedMatches(indices0, ends, scores.clip(0, 1), indices1=indices1)
 
 
-def _on_plane(expected: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    return np.asarray(np.linalg.norm(ends - expected, axis=1) < NOISE_PX)
+def _misfit(expected: np.ndarray, ends: np.ndarray) -> float:
+    """Return the mean squared error of (N, 2) tracks, of which each counts at most `NOISE_PX`."""
+    return float(np.minimum(((ends - expected) ** 2).sum(axis=1), NOISE_PX**2).mean())
 
 
 def _fitted(starts: np.ndarray, ends: np.ndarray, threshold_px: float) -> np.ndarray | None:
