@@ -24,7 +24,6 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from deepdetect.detector.onnx_files.points import MAX_KEYPOINTS, PREFIX
 from deepdetect.detector.points.candidate_features import (
     DETERMINANT_FLOOR,
     GRADIENT_FLOOR,
@@ -49,7 +48,7 @@ from deepdetect.detector.points.hessian_scales import (
     VARIANCES,
 )
 from deepdetect.detector.points.ranker import MAX_DEVIATIONS, load_ranker
-from deepdetect.detector.pretrained import POINTS, POINTS_GRAPH
+from deepdetect.detector.pretrained import GRAY, MAX_KEYPOINTS, POINTS, POINTS_GRAPH, PREFIX
 from deepdetect.features.kernels import ATAN, BINS, RADIUS_PER_WINDOW
 from deepdetect.features.selection import MAX_OFFSET_PX
 
@@ -101,7 +100,7 @@ def points_model() -> onnx.ModelProto:
     """Make the graph that maps images to their best points; an initializer holds their number."""
     graph = Graph(PREFIX)
     count = graph.constant([2048], MAX_KEYPOINTS)
-    gray = gray_of(Tensor(graph, "image"))
+    gray = graph.named(gray_of(Tensor(graph, "image")), GRAY)
     limit = (count * CANDIDATES_PER_KEYPOINT).Max([MIN_CANDIDATES])
     levels = scale_space(gray)
     x, y, scores, sizes, level = choose(*rank_candidates(levels, limit), count)
@@ -172,6 +171,11 @@ class Graph:
             self.made[key] = [Tensor(self, name) for name in names]
         return self.made[key] if outputs > 1 else self.made[key][0]
 
+    def named(self, tensor: Tensor, name: str) -> Tensor:
+        """Return a copy of a tensor under a name of its own."""
+        self.nodes.append(helper.make_node("Identity", [tensor.name], [name]))
+        return Tensor(self, name)
+
     def join(self, inputs: Sequence[Any], axis: int) -> Any:
         """Concatenate tensors."""
         return self.add("Concat", *inputs, axis=axis)
@@ -203,7 +207,7 @@ class Graph:
     ) -> onnx.ModelProto:
         """Return the model; inputs and outputs are given by name, type and shape."""
         for output, tensor in zip(outputs, tensors, strict=True):
-            self.nodes.append(helper.make_node("Identity", [tensor.name], [output[0]]))
+            self.named(tensor, output[0])
         ends = [[helper.make_tensor_value_info(*one) for one in end] for end in (inputs, outputs)]
         constants = [*self.constants.values()]
         graph = helper.make_graph(self.nodes, "points", *ends, constants)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -19,9 +21,10 @@ from ..features.learned import LEARNED
 from ..features.selection import check_ignore, check_max_keypoints, without_frame
 from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import Images, found_in_each, load_image, load_pixels, load_visible, luma
-from .backends.interface import RuntimeOptions
+from .backends import RuntimeOptions, backend_name
 from .heatmap import MAX_AUTO_PIXELS, memory_named
-from .points.descriptor import DESCRIPTOR_GRAPHS, describe_learned, descriptor_type
+from .points.by_graph import detect_by_graph
+from .points.descriptor import DESCRIPTOR_GRAPHS, describe_batch, descriptor_type
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
 from .pretrained import RANKER
@@ -33,6 +36,14 @@ class Descriptor(Protocol):
 
     def describe(self, image: Any, keypoints: Keypoints) -> Keypoints:
         """Return the given keypoints of an image with descriptors and their type."""
+
+
+class _Seen(NamedTuple):
+    """An image's luma and mask, both perhaps scaled down, and its (width, height)."""
+
+    gray: np.ndarray
+    ignore: np.ndarray | None
+    whole: tuple[int, int]
 
 
 class PointDetector:
@@ -62,13 +73,16 @@ class PointDetector:
             such as infrared and visible light, or for maps. "rootsift" is for programs that expect
             SIFT descriptors. A path is an ONNX file written by `deepdetect train-descriptor`. An
             object must have a method `describe(image, keypoints)` like that of this class.
-        backend, device, precision: as in `DeepDetect`, but only the values that mean ONNX Runtime
-            on the CPU in float32 are allowed; others raise an OptionError.
+        backend: "auto" (the fastest on the device), or "onnxruntime" or "openvino", which run an
+            ONNX graph of the detector. On a CPU, the graph takes a multiple of the time.
+        device: "cpu", "cuda", the name of any execution provider of ONNX Runtime or, if the backend
+            is "openvino", of a device of OpenVINO, such as "gpu".
         threads: maximum number of threads. None: one per processor.
+        precision: "float32", the only number format in which positions stay exact.
 
     Raises:
         WeightsError: the ranker or the descriptor is missing, damaged or unsuitable.
-        OptionError: an option is unknown or out of its range.
+        OptionError: an option is unknown, out of its range, or not available on the device.
 
     Example:
         >>> image = np.zeros((64, 64), np.uint8)
@@ -95,17 +109,24 @@ class PointDetector:
         precision: str = "float32",
     ) -> None:
         check_max_keypoints(max_keypoints)
-        for name, value, known in (
-            ("backend", backend, ("auto", "onnxruntime")),
-            ("device", device, ("cpu",)),
-            ("precision", precision, ("float32",)),
-        ):
-            if value not in known:
-                raise OptionError(
-                    f"`{name}={value!r}` is not available in PointDetector: leave it out, or use a "
-                    "DeepDetect"
-                )
-        check_ranges(RuntimeOptions(threads=threads), counts=("threads",))
+        if precision != "float32":
+            raise OptionError(
+                f"`precision={precision!r}` is not available in PointDetector: leave it out, or "
+                "use a DeepDetect"
+            )
+        self._runtime = RuntimeOptions(backend, device, threads)
+        self.backend = backend_name(self._runtime)
+        self._by_graph = (backend, device) != ("auto", "cpu")
+        unusual = {
+            "spread": spread != "none",
+            "ranker": ranker is not None,
+            "max_keypoints": max_keypoints is None,
+        }
+        for name in (name for name, used in unusual.items() if used and self._by_graph):
+            raise OptionError(
+                f"`{name}` as given works only on the CPU: leave `backend` and `device` out, or "
+                f"change `{name}`"
+            )
         self.threads = threads
         check_name("spread", spread, SPREADS)
         if spread != "none" and max_keypoints is None:
@@ -165,7 +186,8 @@ class PointDetector:
             ImageError: the image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
-        return self._find(load_pixels(image, channels), ignore, max_keypoints)
+        seen = self._seen(load_pixels(image, channels), ignore)
+        return self._detected([seen], max_keypoints)[0]
 
     @suggest_keywords
     def detect_batch(
@@ -190,9 +212,7 @@ class PointDetector:
             ImageError: an image cannot be read or is unsuitable.
             OptionError: a mask has another size than its image.
         """
-        return found_in_each(
-            images, channels, ignore, lambda rgb, mask: self._find(rgb, mask, max_keypoints)
-        )
+        return self._detected(found_in_each(images, channels, ignore, self._seen), max_keypoints)
 
     @suggest_keywords
     def extract(
@@ -217,8 +237,42 @@ class PointDetector:
             OptionError: the mask has another size than the image.
             WeightsError: the ONNX file of the descriptor is damaged.
         """
-        rgb = load_pixels(image, channels)
-        return self.describe(rgb, self._find(rgb, ignore, max_keypoints))
+        images = [load_pixels(image, channels)]
+        return self.extract_batch(images, max_keypoints=max_keypoints, ignore=[ignore])[0]
+
+    @suggest_keywords
+    def extract_batch(
+        self,
+        images: Images,
+        *,
+        max_keypoints: int | None = None,
+        ignore: np.ndarray | Images | None = None,
+        channels: Channels = "rgb",
+    ) -> list[Keypoints]:
+        """Detect the best keypoints of several images, and describe them.
+
+        A backend of ONNX runs all images of one size at once, which is faster on a graphics card,
+        and takes memory in proportion to their number.
+
+        Args:
+            images, max_keypoints, ignore, channels: see `detect_batch`.
+
+        Returns:
+            The keypoints of each image as from `extract`, in the order of the images.
+
+        Raises:
+            ImageError: an image cannot be read or is unsuitable.
+            OptionError: a mask has another size than its image.
+            WeightsError: the ONNX file of the descriptor is damaged.
+        """
+        if isinstance(self.descriptor, Descriptor) or self.descriptor_type == ROOT_SIFT:
+
+            def described(rgb: np.ndarray, mask: np.ndarray | None) -> Keypoints:
+                return self.describe(rgb, self._detected([self._seen(rgb, mask)], max_keypoints)[0])
+
+            return found_in_each(images, channels, ignore, described)
+        seen = found_in_each(images, channels, ignore, self._seen)
+        return self._described([each.gray for each in seen], self._detected(seen, max_keypoints))
 
     @suggest_keywords
     def describe(
@@ -243,7 +297,7 @@ class PointDetector:
         with limited_threads(self.threads):
             if self.descriptor_type == ROOT_SIFT:
                 return describe_keypoints(gray, keypoints)
-            return describe_learned(self._scaled(gray), keypoints, self.descriptor)
+        return self._described([self._scaled(gray)], [keypoints])[0]
 
     def __repr__(self) -> str:
         return (
@@ -252,11 +306,7 @@ class PointDetector:
             f"descriptor={str(self.descriptor)!r})"
         )
 
-    def _find(
-        self, rgb: np.ndarray, ignore: np.ndarray | None, max_keypoints: int | None
-    ) -> Keypoints:
-        check_max_keypoints(max_keypoints)
-        most = self.max_keypoints if max_keypoints is None else int(max_keypoints)
+    def _seen(self, rgb: np.ndarray, ignore: np.ndarray | None) -> _Seen:
         rgb, ignore = load_visible(rgb, ignore=ignore)
         gray = luma(rgb)
         whole = gray.shape[::-1]
@@ -269,23 +319,66 @@ class PointDetector:
             # A scaled pixel is ignored if it or one of its 8 neighbours covers an ignored pixel.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
-        with memory_named(gray.shape), limited_threads(self.threads):
-            found = detect_points(
-                gray,
-                most,
-                spread=self.spread,
-                ignore=ignore,
-                ranker=self._ranker,
-                min_logit=self.min_logit,
-            )
+        return _Seen(gray, ignore, whole)
+
+    def _detected(self, seen: Sequence[_Seen], max_keypoints: int | None) -> list[Keypoints]:
+        check_max_keypoints(max_keypoints)
+        most = self.max_keypoints if max_keypoints is None else int(max_keypoints)
+
+        def detect(grays: list[np.ndarray], ignore: list[np.ndarray | None]) -> list[Keypoints]:
+            if self._by_graph:
+                assert most is not None
+                return detect_by_graph(grays, most, self._runtime, ignore, self.min_logit)
+            return [
+                detect_points(
+                    gray,
+                    most,
+                    spread=self.spread,
+                    ignore=mask,
+                    ranker=self._ranker,
+                    min_logit=self.min_logit,
+                )
+                for gray, mask in zip(grays, ignore, strict=True)
+            ]
+
+        found = self._by_size(detect, [each.gray for each in seen], [each.ignore for each in seen])
+        return [self._at_full_size(*each) for each in zip(found, seen, strict=True)]
+
+    def _described(
+        self, grays: Sequence[np.ndarray], keypoints: Sequence[Keypoints]
+    ) -> list[Keypoints]:
+        assert isinstance(self.descriptor, (str, Path))
+        options = self._runtime if self._by_graph else RuntimeOptions()
+        describe = partial(describe_batch, descriptor=self.descriptor, runtime=options)
+        return self._by_size(describe, grays, keypoints)
+
+    def _by_size(
+        self,
+        run: Callable[[list[np.ndarray], list[Any]], list[Keypoints]],
+        grays: Sequence[np.ndarray],
+        others: Sequence[Any],
+    ) -> list[Keypoints]:
+        """Call `run` once for the images of each size or, without a graph, once for each image."""
+        groups: dict[Any, list[int]] = {}
+        for k, gray in enumerate(grays):
+            groups.setdefault(gray.shape if self._by_graph else k, []).append(k)
+        results: dict[int, Keypoints] = {}
+        for rows in groups.values():
+            some = [grays[k] for k in rows]
+            with memory_named(some[0].shape), limited_threads(self.threads):
+                found = run(some, [others[k] for k in rows])
+            results |= zip(rows, found, strict=True)
+        return [results[k] for k in range(len(grays))]
+
+    def _at_full_size(self, found: Keypoints, seen: _Seen) -> Keypoints:
         if self.upright:
             found = replace(found, angles=np.zeros(len(found), np.float32))
-        if size == whole:
+        if found.image_size == seen.whole:
             return found
         assert found.sizes is not None
-        factor = np.divide(whole, size)
+        factor = np.divide(seen.whole, found.image_size)
         xy, sizes = (found.xy + 0.5) * factor - 0.5, found.sizes * factor.mean()
-        return replace(found, xy=xy, image_size=whole, sizes=sizes)
+        return replace(found, xy=xy, image_size=seen.whole, sizes=sizes)
 
     def _scaled(self, gray: np.ndarray) -> np.ndarray:
         height, width = gray.shape

@@ -26,14 +26,22 @@ PRETRAINED: dict[str, str] = {
 STRIDE = 8
 """The network halves an image three times, so the image's sides must be multiples of 8."""
 
-PADDED_IMAGE = "padded_image"
-"""Name of the tensor of the padded image, in ONNX files that pad images to multiples of 8."""
+PADDED_IMAGE, PADDED_LOGITS = "padded_image", "padded_logits"
+"""Tensors between which the network itself lies, in ONNX files that pad images to multiples of 8
+and crop the logits."""
 
 LOGITS = "logits"
 """Name of the ONNX output that holds logits; an output of another name holds probabilities."""
 
 POINTS = "keypoints", "scores", "sizes", "angles"
-"""ONNX outputs of files that include `POINTS_GRAPH`. Only other programs read these outputs."""
+"""Outputs of `POINTS_GRAPH`, and of exported files that include it."""
+
+PREFIX = "points/"
+"""The names of all other tensors in `POINTS_GRAPH`, except for its input, start with this."""
+
+MAX_KEYPOINTS, GRAY = f"{PREFIX}max_keypoints", f"{PREFIX}gray"
+"""Tensors of `POINTS_GRAPH`: the maximum number of keypoints, (1,) int64, which is an initializer,
+and the luma from 0 to 255, (B, 1, H, W) float32."""
 
 
 def pretrained_weights(name: str = "default") -> Path:

@@ -33,7 +33,7 @@ def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_device_that_cannot_start_is_no_damaged_file(broken_cuda: None) -> None:
     with pytest.raises(OptionError, match="CUDA failure 35"):
-        open_onnxruntime(pretrained_weights(), CUDA)
+        open_onnxruntime(pretrained_weights().read_bytes(), CUDA)
 
 
 def test_memory_that_was_given_back_changes_no_answer() -> None:

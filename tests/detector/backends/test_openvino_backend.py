@@ -12,8 +12,8 @@ from deepdetect.detector.backends.interface import RuntimeOptions
 from deepdetect.detector.backends.openvino_backend import open_openvino
 from deepdetect.detector.pretrained import resolve_weights
 path = resolve_weights("default")
-first, second = (open_openvino(path, RuntimeOptions()) for _ in range(2))
-second(np.zeros((1, 3, 32, 32), np.float32))
+first, second = (open_openvino(path.read_bytes(), RuntimeOptions()) for _ in range(2))
+second.run(["logits"], {"image": np.zeros((1, 3, 32, 32), np.float32)})
 del first
 gc.collect()
 del second

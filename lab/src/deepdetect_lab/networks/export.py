@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from deepdetect.detector.onnx_files.export import OnnxOptions, write_model
 from deepdetect.detector.onnx_files.graph import (
     IMAGE,
-    PADDED_LOGITS,
     PROBABILITY,
     add_constants,
     ending_nodes,
@@ -27,7 +26,7 @@ from deepdetect.detector.onnx_files.graph import (
     replace_nodes,
     set_sides,
 )
-from deepdetect.detector.pretrained import LOGITS, PADDED_IMAGE, STRIDE
+from deepdetect.detector.pretrained import LOGITS, PADDED_IMAGE, PADDED_LOGITS, STRIDE
 
 OPSET = 17
 """Version of the ONNX operator set. ONNX Runtime 1.24, OpenVINO and OpenCV 4 can all read it."""

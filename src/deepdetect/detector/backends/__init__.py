@@ -1,6 +1,6 @@
-"""Backends that run the network: ONNX Runtime and OpenVINO."""
+"""Backends that run networks: ONNX Runtime and OpenVINO."""
 
 from .interface import Network, RuntimeOptions
-from .registry import BACKENDS, open_network
+from .registry import BACKENDS, backend_name, open_graph, open_network
 
-__all__ = ["BACKENDS", "Network", "RuntimeOptions", "open_network"]
+__all__ = ["BACKENDS", "Network", "RuntimeOptions", "backend_name", "open_graph", "open_network"]

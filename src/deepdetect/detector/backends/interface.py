@@ -1,8 +1,8 @@
-"""What all backends share: their options, and checks of a network's output."""
+"""What all backends share: options, sessions, and a network that maps images to logits."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -11,7 +11,7 @@ import numpy as np
 
 from ..._shared.errors import DeepDetectError, WeightsError, first_line
 from ..._shared.options import suggest_keywords
-from ..pretrained import LOGITS
+from ..pretrained import LOGITS, PADDED_LOGITS
 
 PROBE_SHAPE = (24, 32)
 """Height and width in pixels of the noise image that tests a loaded network. Chosen by hand."""
@@ -31,7 +31,7 @@ class Network(Protocol):
 @suggest_keywords
 @dataclass(frozen=True)
 class RuntimeOptions:
-    """How the network is run. The fields are options of `DeepDetect`."""
+    """How networks are run. The fields are options of `DeepDetect` and `PointDetector`."""
 
     backend: str = "auto"
     device: str = "cpu"
@@ -39,9 +39,50 @@ class RuntimeOptions:
     precision: str = "float32"
 
 
-def output_to_read(names: Sequence[str]) -> str:
-    """Return the name of the output to read: the logits if there are any, otherwise the first."""
-    return LOGITS if LOGITS in names else names[0]
+class Session(Protocol):
+    """An ONNX graph that a runtime has loaded. `inputs` and `outputs` are the tensors' names."""
+
+    inputs: list[str]
+    outputs: list[str]
+
+    def run(self, outputs: Sequence[str], given: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Compute outputs. Exceptions are those of the runtime."""
+
+    def reload(self) -> None:
+        """Load the graph again before the next run, if a failed run may have damaged it."""
+
+    def release_memory(self, smallest: Mapping[str, np.ndarray]) -> None:
+        """Release the memory kept between runs; `smallest` are inputs that need little memory."""
+
+
+class OnnxNetwork:
+    """A network in a session. `onnx_path` is None if the network cannot run in tiles."""
+
+    def __init__(self, session: Session, path: Path, options: RuntimeOptions) -> None:
+        self._session, self._path, self.threads = session, path, options.threads
+        self._input = session.inputs[0]
+        known = (name for name in (LOGITS, PADDED_LOGITS) if name in session.outputs)
+        self._output = next(known, session.outputs[0])
+        # Tiles, which are for float32 only, read the parts of the network from `onnx_path`.
+        self.onnx_path = path if options.precision == "float32" else None
+        self._works = False  # whether a run has given a correct result
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        try:
+            output = self._session.run([self._output], {self._input: image})[0]
+            # If memory is short, OpenVINO may return an empty map or that of the previous image.
+            if self._works and output.shape[2:] != image.shape[2:]:
+                raise MemoryError("the runtime gave a map of another size than the image")
+        except Exception as error:  # the runtimes' exceptions share no base class
+            self._session.reload()
+            raise failed_run(error, image.shape) from None
+        logits = as_logits(output, self._output, image.shape, self._path)
+        self._works = True
+        return logits
+
+    def release_memory(self) -> None:
+        """Release the memory that the session keeps between runs."""
+        self._session.release_memory({self._input: np.zeros((1, 3, *PROBE_SHAPE), np.float32)})
 
 
 def as_logits(
@@ -63,7 +104,7 @@ def as_logits(
             f"{path} gives values that are not finite: it is damaged, or its training diverged; "
             "use other weights"
         )
-    if name == LOGITS:
+    if name in (LOGITS, PADDED_LOGITS):
         return output
     if low < 0 or high > 1:
         raise WeightsError(

@@ -17,11 +17,14 @@ FIELDS: dict[str, dict[str, tuple[int, str]]] = {
         "input": (11, "Tensor"),
         "output": (12, "Tensor"),
     },
-    "Node": {"input": (1, "string"), "output": (2, "string")},
-    "Weights": {"name": (8, "string")},
+    "Node": {"input": (1, "string"), "output": (2, "string"), "attribute": (5, "Attribute")},
+    "Attribute": {"graph": (6, "Graph")},
+    "Weights": {"side": (1, "int64"), "element": (2, "int32"), "name": (8, "string")},
     "Tensor": {"name": (1, "string"), "type": (2, "Type")},
     "Type": {"array": (1, "Array")},
-    "Array": {"element": (1, "int32")},
+    "Array": {"element": (1, "int32"), "shape": (2, "Shape")},
+    "Shape": {"side": (1, "Side")},
+    "Side": {"length": (1, "int64")},
 }
 """Numbers and types of the fields in onnx.proto3, by message. All fields are declared as repeated,
 because Protobuf writes a single value in the same way."""
@@ -30,9 +33,10 @@ FLOAT = 1
 
 
 def cut_onnx(model: bytes, inputs: Collection[str], outputs: Collection[str]) -> bytes:
-    """Return the part of an ONNX file that computes `outputs` from `inputs`, all float32 tensors.
+    """Return the part of an ONNX file that computes float32 `outputs` from `inputs`.
 
-    A KeyError names a tensor that is missing or cannot be computed from the inputs.
+    Inputs are float32 maps of four axes, or constants of any type and shape, whose values are then
+    given in each run. A KeyError names a tensor that is missing or cannot be computed from them.
     """
     part = _model_class()()
     part.ParseFromString(model)
@@ -42,19 +46,35 @@ def cut_onnx(model: bytes, inputs: Collection[str], outputs: Collection[str]) ->
     for node in reversed(graph.node):
         if not wanted.isdisjoint(node.output):
             nodes.append(node)
-            used.update(node.input)
-            wanted = (wanted | {*node.input}) - {*node.output, *given, ""}
+            used |= _read_by(node)
+            wanted = (wanted | _read_by(node)) - {*node.output, *given, ""}
     if wanted:
         raise KeyError(min(wanted))
-    weights = [one for one in graph.initializer if one.name[0] in used]
+    constants = {one.name[0]: (one.element[0], one.side) for one in graph.initializer}
+    weights = [one for one in graph.initializer if one.name[0] in used - {*inputs}]
     del graph.node[:], graph.initializer[:], graph.input[:], graph.output[:]
     graph.node.extend(nodes[::-1])
     graph.initializer.extend(weights)
     for name in inputs:
-        graph.input.add(name=[name]).type.add().array.add().element.append(FLOAT)
+        element, sides = constants.get(name, (FLOAT, [None] * 4))
+        array = graph.input.add(name=[name]).type.add().array.add(element=[element])
+        shape = array.shape.add()
+        for side in sides:
+            shape.side.add(length=[] if side is None else [side])
     for name in outputs:
         graph.output.add(name=[name])
     return part.SerializeToString()
+
+
+def _read_by(node: Any) -> set[str]:
+    """Return the names of the tensors that a node reads, also inside of its loops."""
+    names = {*node.input}
+    for loop in (graph for attribute in node.attribute for graph in attribute.graph):
+        own = {one.name[0] for one in (*loop.input, *loop.initializer)}
+        for inner in loop.node:
+            names |= _read_by(inner) - own
+            own.update(inner.output)
+    return names
 
 
 @functools.cache

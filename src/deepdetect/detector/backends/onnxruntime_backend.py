@@ -3,56 +3,45 @@
 from __future__ import annotations
 
 import contextlib
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..._shared.errors import OptionError, first_line, unknown_name
 from ..._shared.runtimes import CPU, import_onnxruntime, start_session
-from ..pretrained import LOGITS, POINTS
-from .interface import (
-    PROBE_SHAPE,
-    RuntimeOptions,
-    as_logits,
-    failed_run,
-    output_to_read,
-    unreadable,
-)
-from .onnx_parts import cut_onnx
+from .interface import RuntimeOptions
 
 PROVIDERS = {"cpu": CPU, "cuda": "CUDAExecutionProvider"}
 
 
-class OnnxRuntimeNetwork:
-    """A network run by ONNX Runtime."""
+class OnnxRuntimeSession:
+    """A graph run by ONNX Runtime."""
 
-    def __init__(self, session: Any, path: Path, threads: int | None) -> None:
+    def __init__(self, session: Any) -> None:
         self._session = session
-        self._input_name = session.get_inputs()[0].name
-        self._output_name = output_to_read([value.name for value in session.get_outputs()])
-        self.onnx_path = path
-        self.threads = threads
+        self.inputs = [value.name for value in session.get_inputs()]
+        self.outputs = [value.name for value in session.get_outputs()]
 
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        try:
-            output = self._session.run([self._output_name], {self._input_name: image})[0]
-        except Exception as error:  # ONNX Runtime's exceptions share no base class
-            raise failed_run(error, image.shape) from None
-        return as_logits(output, self._output_name, image.shape, self.onnx_path)
+    def run(self, outputs: Sequence[str], given: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Compute outputs."""
+        found: list[np.ndarray] = self._session.run([*outputs], {**given})
+        return found
 
-    def release_memory(self) -> None:
+    def reload(self) -> None:
+        """Do nothing, because a failed run damages nothing."""
+
+    def release_memory(self, smallest: Mapping[str, np.ndarray]) -> None:
         """Release the memory that the session keeps between runs."""
         settings = import_onnxruntime().RunOptions()
         settings.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
-        smallest = np.zeros((1, 3, *PROBE_SHAPE), np.float32)
         # ONNX Runtime raises an error if it keeps no memory on the CPU.
         with contextlib.suppress(Exception):
-            self._session.run([self._output_name], {self._input_name: smallest}, settings)
+            self._session.run(self.outputs, {**smallest}, settings)
 
 
-def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
-    """Load an ONNX file; a device that is not available raises an OptionError."""
+def open_onnxruntime(model: bytes, options: RuntimeOptions) -> OnnxRuntimeSession:
+    """Load an ONNX graph; a device that is not available raises an OptionError."""
     onnxruntime = import_onnxruntime()
     device = options.device
     provider = PROVIDERS.get(device, device)
@@ -66,13 +55,15 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
             f"{' or '.join(['cpu', *(name for name in available if name != CPU)])}"
         )
     try:
-        session = start_session(_logits_only(path), options.threads, provider)
+        session = start_session(model, options.threads, provider)
     except Exception as error:  # ONNX Runtime's exceptions share no base class
-        raise unreadable(path, error) if provider == CPU else _not_started(device, error) from None
+        if provider == CPU:
+            raise
+        raise _not_started(device, error) from None
     # If a provider cannot start, ONNX Runtime silently continues on the CPU.
     if provider not in session.get_providers():
         raise _not_started(device, "no reason given")
-    return OnnxRuntimeNetwork(session, path, options.threads)
+    return OnnxRuntimeSession(session)
 
 
 def _not_started(device: str, reason: object) -> OptionError:
@@ -80,13 +71,3 @@ def _not_started(device: str, reason: object) -> OptionError:
         f"the device {device} could not start ({first_line(reason)}): check its driver "
         "and libraries, or leave `device` out"
     )
-
-
-def _logits_only(path: Path) -> str | bytes:
-    """Return the path of an ONNX file or, if it also outputs keypoints, a copy without them."""
-    # ONNX Runtime would compute all outputs of a file, even those that are not requested.
-    model = path.read_bytes()
-    if all(name.encode() in model for name in (LOGITS, *POINTS)):
-        with contextlib.suppress(KeyError):
-            return cut_onnx(model, ["image"], [LOGITS])
-    return str(path)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import __version__
-from ..pretrained import LOGITS, PADDED_IMAGE, STRIDE
+from ..pretrained import LOGITS, PADDED_IMAGE, PADDED_LOGITS, STRIDE
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, NodeProto
 
-IMAGE, PROBABILITY, PADDED_LOGITS = "image", "probability", "padded_logits"
+IMAGE, PROBABILITY = "image", "probability"
 """Names of tensors. The network itself maps `PADDED_IMAGE` to `PADDED_LOGITS`; the other nodes of a
 file pad, crop and compute probabilities."""
 

@@ -6,17 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..pretrained import POINTS, POINTS_GRAPH
+from ..pretrained import MAX_KEYPOINTS, POINTS, POINTS_GRAPH, PREFIX
 from .graph import replace_nodes
 
 if TYPE_CHECKING:
     from onnx import ModelProto
-
-PREFIX = "points/"
-"""The names of all tensors in `POINTS_GRAPH`, except for input and outputs, start with this."""
-
-MAX_KEYPOINTS = f"{PREFIX}max_keypoints"
-"""Name of the initializer that sets the maximum number of keypoints."""
 
 
 def add_points(model: ModelProto, max_keypoints: int) -> None:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import OptionError, WeightsError, first_line
+from ..._shared.errors import OptionError, WeightsError
 from ..._shared.machine import thread_limit
 from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
-from ..._shared.runtimes import start_session
 from ...features.keypoints import Keypoints
 from ...features.learned import (
     CROSS_MODAL,
@@ -25,6 +23,8 @@ from ...features.learned import (
 from ...features.scale_space import set_angles
 from ...features.sift import ROOT_SIFT
 from ...geometry.images import edge_strength
+from ..backends import RuntimeOptions, open_graph
+from ..backends.interface import Session, failed_run
 from ..pretrained import RANKER, resolve_weights
 
 DESCRIPTOR_GRAPHS = {
@@ -32,8 +32,8 @@ DESCRIPTOR_GRAPHS = {
     LEARNED_FREE: RANKER.with_name("descriptor_free.onnx"),
     CROSS_MODAL: RANKER.with_name("descriptor.onnx"),
 }
-"""ONNX files by descriptor type. Their inputs are `luma` (1, 1, H, W) in [0, 1], `xy` (1, N, 2) in
-pixels and `sizes` (1, N), diameters in pixels. Their output is `descriptors` (1, N, 64), unit
+"""ONNX files by descriptor type. Their inputs are `luma` (B, 1, H, W) in [0, 1], `xy` (B, N, 2) in
+pixels and `sizes` (B, N), diameters in pixels. Their output is `descriptors` (B, N, 64), unit
 vectors. All are float32."""
 
 DIGEST_LENGTH = 16
@@ -48,36 +48,64 @@ def describe_learned(
 ) -> Keypoints:
     """Return keypoints with learned descriptors at their own sizes and angles.
 
-    `gray` is the (H, W) uint8 luma of the image, possibly scaled down. Angles that are missing or
-    -1 are replaced by the dominant gradient orientations. For "cross-modal", the luma is replaced
-    by its `edge_strength`, and all angles by the dominant orientations of that map. `descriptor` is
-    a name in `DESCRIPTOR_GRAPHS`, or an ONNX file with the same inputs and outputs. Keypoints
-    without sizes raise an OptionError.
+    See `describe_batch`.
+    """
+    return describe_batch([gray], [keypoints], descriptor)[0]
+
+
+def describe_batch(
+    grays: Sequence[np.ndarray],
+    keypoints: Sequence[Keypoints],
+    descriptor: str | Path = LEARNED,
+    runtime: RuntimeOptions = RuntimeOptions(),
+) -> list[Keypoints]:
+    """Return the keypoints of images of one size with learned descriptors, computed in one run.
+
+    `grays` are the (H, W) uint8 lumas of the images, possibly scaled down. Angles that are missing
+    or -1 are replaced by the dominant gradient orientations. For "cross-modal", the luma is
+    replaced by its `edge_strength`, and all angles by the dominant orientations of that map.
+    `descriptor` is a name in `DESCRIPTOR_GRAPHS`, or an ONNX file with the same inputs and outputs.
+    Keypoints without sizes raise an OptionError.
     """
     kind = descriptor_type(descriptor)
-    if not len(keypoints):
-        none = np.empty((0, LENGTH), np.float32)
-        return replace(keypoints, descriptors=none, descriptor_type=kind)
-    if keypoints.sizes is None or not (keypoints.sizes > 0).all():
-        raise OptionError(
-            "learned descriptors need sizes above 0: use a PointDetector's keypoints, or RootSIFT"
+    height, width = grays[0].shape
+    below, right, most = -height % STRIDE, -width % STRIDE, max(map(len, keypoints))
+    luma = np.empty((len(grays), 1, height + below, width + right), np.float32)
+    xy = np.zeros((len(grays), most, 2), np.float32)
+    sizes = np.ones((len(grays), most), np.float32)
+    angles: list[np.ndarray] = []
+    for k, (gray, points) in enumerate(zip(grays, keypoints, strict=True)):
+        if len(points) and (points.sizes is None or not (points.sizes > 0).all()):
+            raise OptionError(
+                "learned descriptors need sizes above 0: use a PointDetector's keypoints, or "
+                "RootSIFT"
+            )
+        given, own = points.angles, slice(len(points))
+        if kind == CROSS_MODAL:
+            gray, given = edge_strength(gray), None
+        factor = np.divide((width, height), points.image_size).astype(np.float32)
+        xy[k, own] = (points.xy + 0.5) * factor - 0.5
+        sizes[k, own] = 0 if points.sizes is None else points.sizes * factor.mean()
+        angles.append(set_angles(gray, xy[k, own], sizes[k, own], given))
+        luma[k, 0] = cv2.copyMakeBorder(gray, 0, below, 0, right, cv2.BORDER_REFLECT_101)
+    upright = np.empty((len(grays), 0, LENGTH), np.float32)
+    if most:
+        luma /= 255
+        session = _open(DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor)), runtime)
+        try:
+            (upright,) = session.run(["descriptors"], {"luma": luma, "xy": xy, "sizes": sizes})
+        except Exception as error:  # the runtimes' exceptions share no base class
+            session.reload()
+            raise failed_run(error, luma.shape) from None
+    return [
+        replace(
+            points,
+            angles=turns,
+            descriptors=turn_descriptors(codes[: len(points)], -turns),
+            descriptor_type=kind,
         )
-    given = keypoints.angles
-    if kind == CROSS_MODAL:
-        gray, given = edge_strength(gray), None
-    height, width = gray.shape
-    factor = np.divide((width, height), keypoints.image_size).astype(np.float32)
-    xy, sizes = (keypoints.xy + 0.5) * factor - 0.5, keypoints.sizes * factor.mean()
-    angles = set_angles(gray, xy, sizes, given)
-    below, right = -height % STRIDE, -width % STRIDE
-    padded = cv2.copyMakeBorder(gray, 0, below, 0, right, cv2.BORDER_REFLECT_101)
-    luma = padded[None, None].astype(np.float32) / 255
-    inputs = {"luma": luma, "xy": xy[None], "sizes": sizes[None]}
-    path = DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor))
-    session = _session(path, kind[-DIGEST_LENGTH:], thread_limit())
-    upright = session.run(["descriptors"], inputs)[0][0]
-    descriptors = turn_descriptors(upright, -angles)
-    return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type=kind)
+        for points, turns, codes in zip(keypoints, angles, upright, strict=True)
+    ]
 
 
 def descriptor_type(descriptor: str | Path) -> str:
@@ -88,22 +116,17 @@ def descriptor_type(descriptor: str | Path) -> str:
     if str(descriptor) in (*DESCRIPTOR_GRAPHS, ROOT_SIFT):
         return str(descriptor)
     path = resolve_weights(descriptor)
-    digest = file_digest(path)[:DIGEST_LENGTH]
-    _session(path, digest, thread_limit())  # raises an error if the file is no descriptor
-    return f"{LEARNED}-{digest}"
+    _open(path, RuntimeOptions())  # raises an error if the file is no descriptor
+    return f"{LEARNED}-{file_digest(path)[:DIGEST_LENGTH]}"
 
 
-@functools.cache
-def _session(path: Path, content: str, threads: int | None) -> Any:
-    """Load a file, unless it is cached with the same `content`, the start of its SHA-256."""
-    try:
-        session = start_session(str(path), threads)
-        names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]
-        if names != ["luma", "xy", "sizes", "descriptors"]:
-            raise ValueError("its inputs and outputs are not those of a descriptor")
-    except Exception as error:  # the exceptions of ONNX Runtime share no base class
+def _open(path: Path, runtime: RuntimeOptions) -> Session:
+    """Load a file; one that does not describe keypoints raises a WeightsError."""
+    session = open_graph(path, replace(runtime, threads=thread_limit()))
+    names = {*session.inputs}, {*session.outputs}
+    if names != ({"luma", "xy", "sizes"}, {"descriptors"}):
         raise WeightsError(
-            f"{path} does not describe keypoints ({first_line(error)}): "
-            "use the descriptor.onnx that `deepdetect train-descriptor` writes"
-        ) from None
+            f"{path} does not describe keypoints: use the descriptor.onnx that `deepdetect "
+            "train-descriptor` writes"
+        )
     return session

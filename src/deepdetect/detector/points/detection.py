@@ -141,6 +141,12 @@ def candidate_angles(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
     return angles
 
 
+def ranking_logits(scores: np.ndarray) -> np.ndarray:
+    """Return the (N,) float32 logits of scores above 0, up to rounding (see `ranking_scores`)."""
+    tail = np.minimum(scores, 1 - scores).clip(np.finfo(np.float32).tiny)
+    return np.copysign(0.5 / tail - 1, scores - 0.5).astype(np.float32)
+
+
 def ranking_scores(logits: np.ndarray) -> np.ndarray:
     """Map (N,) float32 logits in descending order to strictly descending scores in (0, 1).
 

@@ -34,10 +34,10 @@ def export_descriptor(network: KeypointNetwork, path: Path) -> None:
         layers: Any = [network.get_submodule(name) for name in (linear, norm)]
         setattr(network, linear, fuse_linear_bn_eval(*layers))
         setattr(network, norm, nn.Identity())
-    luma = torch.zeros(1, 1, STRIDE, 2 * STRIDE)
-    inputs = {"luma": luma, "xy": torch.ones(1, 50, 2), "sizes": torch.ones(1, 50)}
-    axes = {name: {1: "keypoints"} for name in ("xy", "sizes", "descriptors")}
-    axes["luma"] = {2: "height", 3: "width"}
+    luma = torch.zeros(2, 1, STRIDE, 2 * STRIDE)
+    inputs = {"luma": luma, "xy": torch.ones(2, 50, 2), "sizes": torch.ones(2, 50)}
+    axes = {name: {0: "batch", 1: "keypoints"} for name in ("xy", "sizes", "descriptors")}
+    axes["luma"] = {0: "batch", 2: "height", 3: "width"}
     model = to_onnx(network, inputs, "descriptors", axes)
     graph = model.graph
     for kernel in [each for each in graph.initializer if math.prod(each.dims) > MIN_HALVED]:

@@ -229,7 +229,7 @@ def read_map(features: Tensor, xy: Tensor) -> Tensor:
     xy = xy.clamp(min=0).minimum(last)
     origin = xy.floor().minimum(last - 1)
     (right, below), width = (xy - origin).unbind(-1), shape[3]
-    image = torch.arange(len(features), device=xy.device)[:, None] * (shape[2] * width)
+    image = torch.arange(shape[0], device=xy.device)[:, None] * (shape[2] * width)  # type: ignore[call-overload]
     first = (origin[..., 1] * width + origin[..., 0]).long() + image
     pixels = features.permute(0, 2, 3, 1).flatten(0, 2)
     weights = (1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below
