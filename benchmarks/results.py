@@ -362,7 +362,7 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
         subprocess.run([sys.executable, *words], check=True)
         return
     folder.mkdir(parents=True, exist_ok=True)
-    printed = folder / "printed.txt"  # keeps hours of work if parsing fails
+    printed = folder / "printed.txt"  # is kept if parsing fails, because stages take hours
     with printed.open("w") as stdout:
         subprocess.run([sys.executable, *words], check=True, stdout=stdout)
     text = printed.read_text()

@@ -1,4 +1,4 @@
-"""Measure features, pairs and matches of growing synthetic collections on a Ray cluster.
+"""Measure the cost of features, pairs and matches of growing collections on a Ray cluster.
 
     python benchmarks/scale.py PHOTOGRAPHS [COUNT ...] [--work FOLDER]
 

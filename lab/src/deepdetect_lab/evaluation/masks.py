@@ -149,7 +149,7 @@ def check_scale(image: np.ndarray, scale: float, name: str = "an image") -> None
 def score_at_scale(
     detector: DeepDetect, images: Iterable[np.ndarray], scale: float
 ) -> dict[str, MaskScore]:
-    """Scale (H, W, 3) images; score the weights by fusion labels computed from the scaled images.
+    """Scale (H, W, 3) images; score the weights by labels that `fuse` makes of the scaled images.
 
     The network processes images at their scaled size. Returns a score for each visibility that
     occurs, "normal" or "low".

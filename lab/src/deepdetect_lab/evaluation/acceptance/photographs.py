@@ -41,7 +41,7 @@ def oxford(data: Path) -> Iterator[JudgedPair]:
 
 
 def middlebury(data: Path) -> Iterator[JudgedPair]:
-    """Yield rectified pairs of scenes that are not planar, at `MIDDLEBURY_SIDES_PX`."""
+    """Yield rectified pairs of scenes that are not planar, at the sizes `MIDDLEBURY_SIDES_PX`."""
     for left in sorted(data.glob("middlebury/*/left.png")):
         for side in MIDDLEBURY_SIDES_PX:
             kind = f"middlebury, {side or 'native'}"

@@ -70,7 +70,7 @@ def corners(width: float, height: float) -> np.ndarray:
 
 
 def moved_corners(rng: np.random.Generator, size: tuple[int, int], by: float) -> np.ndarray:
-    """Return a homography that moves the corners of an image by a fraction of its height."""
+    """Return a homography that moves each image corner at random by up to `by` times the height."""
     outline = corners(*size)
     moved = outline + rng.uniform(-by, by, (4, 2)) * size[1]
     return np.asarray(cv2.getPerspectiveTransform(outline, moved.astype(np.float32)))

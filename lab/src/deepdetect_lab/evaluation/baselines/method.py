@@ -1,4 +1,4 @@
-"""Local features, which benchmarks compare: pairs of a detector and a descriptor."""
+"""Local features that benchmarks compare. Each consists of a detector and a descriptor."""
 
 from __future__ import annotations
 
