@@ -54,7 +54,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--geometry-weights", default="dense", help="for stereo pairs")
+    parser.add_argument("--geometry-weights", default="dense", help="weights for the stereo pair")
     parser.add_argument("--rounds", type=int, default=5)
     arguments = parser.parse_args()
     scenes = load_oxford(arguments.data / "oxford")

@@ -62,7 +62,7 @@ def main() -> None:
     """Print a table with a row for each scene and way."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of the scenes")
-    parser.add_argument("--repeats", type=int, default=3, help="the fastest counts (default: 3)")
+    parser.add_argument("--repeats", type=int, default=3, help="runs; the fastest one is taken")
     arguments = parser.parse_args()
     detector = DeepDetect("dense")
     rows: list[Row] = []

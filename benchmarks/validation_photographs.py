@@ -29,8 +29,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photographs", type=Path)
     parser.add_argument("--weights", action="append", required=True, help="name or file")
-    parser.add_argument("--short-side", type=int, default=480, help="in pixels (default 480)")
-    parser.add_argument("--every", type=int, default=1, help="take every n-th (default 1: all)")
+    parser.add_argument("--short-side", type=int, default=480, help="of the views, in pixels")
+    parser.add_argument("--every", type=int, default=1, help="use every n-th photograph")
     arguments = parser.parse_args()
     options = options_of(arguments.short_side)
     images = list_images(arguments.photographs, options, ())[:: arguments.every]
