@@ -1,10 +1,10 @@
-"""CPU seconds and memory of keypoints and of matches, by the size of the image.
+"""Measure CPU seconds and memory of keypoints and matches for several image sizes.
 
     python benchmarks/costs.py PHOTOGRAPH PHOTOGRAPH [--rounds 3]
 
 Two photographs of one scene are scaled to each size. Everything runs on one thread with default
-options. Each cell is measured in a separate process: the time of the fastest round after one that
-compiles, and the peak memory of the process, including Python and all libraries.
+options. Each cell is measured in a separate process. A first round compiles; the time is that of
+the fastest later round. The memory is the peak of the process, including Python and all libraries.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from deepdetect_lab.evaluation.profiling import peak_memory, run_in_child
 from deepdetect_lab.evaluation.report import Table
 
 SIDES_PX = (640, 1600, 6000)
-"""Longer sides of the images: of a video frame, of about the two megapixels up to which the network
-works at full resolution, and of a camera."""
+"""Longer sides of the images in pixels: of a video frame, of an image of about two megapixels, up
+to which the network works at full resolution, and of a camera's photograph."""
 
 POINTS = 2048
 
@@ -75,7 +75,7 @@ def measure(name: str, photographs: list[str], side_px: int, rounds: int) -> dic
 
 
 def scaled(image: np.ndarray, side_px: int) -> np.ndarray:
-    """Scale an image so that its longer side has the given length."""
+    """Scale an image so that its longer side has the given length in pixels."""
     ratio = side_px / max(image.shape)
     way = cv2.INTER_AREA if ratio < 1 else cv2.INTER_CUBIC
     return cv2.resize(image, None, fx=ratio, fy=ratio, interpolation=way)

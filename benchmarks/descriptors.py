@@ -1,30 +1,31 @@
-"""Correct matches by descriptors alone: RootSIFT and the learned descriptors on the same points.
+"""Compare RootSIFT and the learned descriptors, on the same points, by their correct matches.
 
     python benchmarks/descriptors.py DATA [--method edgepoint2_t32.onnx ...]
 
-DATA contains the folders oxford, hpatches, hdr, fountain, entry and the clips of KITTI. It may also
-contain roadscene, with crop_LR_visible and cropinfrared of the public photographs of that name.
+DATA contains the folders oxford, hpatches, hdr, fountain, entry, kitti-clip and kitti-clip2. It may
+also contain roadscene, with the folders crop_LR_visible and cropinfrared of the public data set.
 
-Images have 2,048 keypoints, matched as mutual nearest neighbours without a ratio test. SIFT
-(with RootSIFT, its best keypoints at any contrast) and files of other methods have their own
-keypoints. The columns are:
+Images have 2,048 keypoints, matched as mutual nearest neighbours without a ratio test. SIFT (best
+keypoints at any contrast, with RootSIFT) and methods from files have their own keypoints. The
+columns are:
 
-- Correct matches: means over pairs of matches within 3 px of ground truth; 2 px for hdr, and 5 px
-  for roadscene, whose photographs in visible and infrared light are aligned less exactly.
-- dark, blurred: the first image of each Oxford scene with a copy of 1/8 of the light and noise of
-  one grey level, and with a copy blurred by a Gaussian of 2 px.
-- worst turn: three of these images with rotated copies, in steps of 15 degrees, as square windows
-  that show equal areas: the worst angle relative to the best one. Quarter turns are left out, since
-  interpolation does not blur them.
-- hdr: the exposure of middle grey with each darker one; a sum over all.
+- HPatches, kinds of change in Oxford, dark, blurred, hdr, infrared: number of matches within 3 px
+  of the ground truth, mean over pairs. The limit is 2 px for hdr, and 5 px for infrared
+  (roadscene), where photographs in visible and infrared light are aligned less exactly.
+- dark, blurred: matches of the first image of each Oxford scene with a copy that has 1/8 of the
+  light and noise of one grey level, and with a copy blurred by a Gaussian with a sigma of 2 px.
+- worst turn: matches of three of these images with copies rotated in steps of 15 degrees and
+  cropped to squares, which show equal areas. The number at the worst angle is divided by that at
+  the best one. Quarter turns are left out, since interpolation does not blur them.
+- hdr: the exposure nearest to middle grey with each darker one; here, the sum over all pairs.
 - fountain, entry, clips: area under the curve of pose errors up to 5 degrees, with the default
   ratio test. It is a mean over five orders of the matches, on which MAGSAC's result depends.
-  Fountain is also measured with 512 keypoints. Clips have 30 pairs each, 1 to 25 frames apart.
-- lost: problems that RootSIFT on our points solves and this method fails to solve. Solved are
-  homographies of Oxford within 3 px, and poses of fountain and entry within 10 degrees in most
-  orders.
-- time: processor time of keypoints and descriptors for an image of 640x480, relative to OpenCV's
-  SIFT with descriptors, on one processor; medians over rounds in which methods take turns.
+  Fountain is also measured with 512 keypoints. Clips have 30 pairs each, 1 to 20 frames apart.
+- lost: number of pairs that RootSIFT on our points solves and this method does not. A pair of
+  Oxford is solved if its homography has a corner error of at most 3 px, a pair of fountain or entry
+  if the median pose error over the orders is at most 10 degrees.
+- time: processor time of keypoints and descriptors for an image of 640x480, divided by that of
+  OpenCV's SIFT with descriptors, on one processor; both are medians over alternating rounds.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ def measure(extract: Extract, data: Path) -> tuple[Row, set[str]]:
 
 
 def relative_time(extract: Extract, rgb: np.ndarray) -> float:
-    """Return the processor time for an image, relative to OpenCV's SIFT."""
+    """Return the processor time for an image, divided by that of OpenCV's SIFT."""
     image, sift = cv2.resize(rgb, (640, 480)), cv2.SIFT_create(KEYPOINTS)
     seconds = []
     for _ in range(ROUNDS):
@@ -204,7 +205,7 @@ def _pose_errors(
 
 
 def errors_in_orders(found: Matches, pair: PosedPair) -> list[float]:
-    """Return the pose error for each order of the matches."""
+    """Return the pose error in degrees for each of `ORDERS` random orders of the matches."""
     cameras = pair.first.camera.matrix, pair.second.camera.matrix
     errors = []
     for order in range(ORDERS):

@@ -1,21 +1,22 @@
-"""How exactly matches lie before and after `refine_matches`, on the same points.
+"""Measure the errors of matches before and after `refine_matches`, on the same points.
 
     python benchmarks/exact_matches.py DATA
 
-DATA contains the folders oxford (with refined homographies), hpatches, fountain, entry and the
-clips of KITTI. Images have 2,048 keypoints, matched by `match_features`: without a ratio test for
+DATA contains the folders oxford (with refined homographies), hpatches, fountain, entry, kitti-clip
+and kitti-clip2. Images have 2,048 keypoints, matched by `match_features`: without a ratio test for
 homographies, with the default one for poses.
 
 - Oxford, HPatches: mean number per pair of matches within 1 px of the homography, and the median
   over pairs of the median error of matches within 3 px.
-- synthetic: the median error, in pixels, of views of the first images of Oxford that are shifted,
-  turned by 20 degrees and enlarged by 1.3, or blurred by 2 px, with noise of 2 grey levels.
-- deviations: the median error of these, divided by the standard deviation that the covariances
-  tell; 1.18 by a normal distribution.
+- synthetic: median error in pixels of matches between the first images of Oxford and synthetic
+  views, which are shifted, rotated by 20 degrees and enlarged by 1.3, or shifted and blurred by
+  2 px, with noise of 2 grey levels.
+- deviations: median error of the aligned matches of synthetic views, in standard deviations from
+  `Matches.covariances`; it is 1.18 for a normal distribution in two dimensions.
 - poses: area under the curve of pose errors up to 1 and 5 degrees, means over five orders of the
   matches; 30 pairs of each clip.
-- time: median processor time of `refine_matches` for the pairs of Oxford, in ms per 2,048 matches,
-  divided by that of OpenCV's SIFT for one image of 640x480.
+- time: median processor time of `refine_matches` per 2,048 matches of the pairs of Oxford, divided
+  by that of OpenCV's SIFT for one image of 640x480.
 """
 
 from __future__ import annotations
@@ -42,18 +43,19 @@ from deepdetect_lab.evaluation.report import Row, Table
 
 EXACT_PX, AUC_DEG, UNALIGNED_PX2 = 1.0, (1, 5), 0.99
 BLURS_PX, ZOOM, TURN_DEG, SHIFT_PX, NOISE = (0.0, 2.0), 1.3, 20.0, (0.4, -0.3), 2.0
-"""The text at the top explains these numbers. Chosen by hand."""
+"""Aligned matches have variances below `UNALIGNED_PX2` square pixels, the other matches have 1. The
+text at the top explains the other numbers. Chosen by hand."""
 
 
 class Measured:
-    """Matches of all pairs before and after refinement; features of images are kept."""
+    """Matches of all pairs before and after refinement; features of images are cached."""
 
     def __init__(self, data: Path) -> None:
         self.data, self.detector = data, PointDetector(KEYPOINTS)
         self.features = cache(lambda path: self.detector.extract(load_image(path)))
 
     def planar(self, pairs: list[PlanarPair], seconds: list[float]) -> tuple[Row, Row]:
-        """Return the columns of planar pairs; append the times of refinement."""
+        """Return the columns of planar pairs; append the seconds of refinement per match."""
         counts: list[list[int]] = [[], []]
         medians: list[list[float]] = [[], []]
         for pair in pairs:
@@ -114,7 +116,7 @@ class Measured:
 
 
 def normalised(refined: Matches, true: np.ndarray) -> float:
-    """Return the median error of aligned matches in units of its standard deviation."""
+    """Return the median error of the aligned matches in standard deviations."""
     assert refined.covariances is not None
     aligned = refined.covariances[:, 0, 0] < UNALIGNED_PX2
     off, inverse = (refined.points1 - true)[aligned], np.linalg.inv(refined.covariances[aligned])

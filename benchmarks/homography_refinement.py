@@ -4,8 +4,8 @@ In two rounds, corners of the first image are tracked to the warped second image
 homography is fitted to the tracks. In the last step, all pixels of reduced copies are aligned
 (Evangelidis and Psarakis, "Parametric image alignment using enhanced correlation coefficient
 maximization", 2008). For cross-validation, the image is divided into the black and the white
-squares of a chessboard. The correction fitted to either colour is used to warp the other. The step
-is kept only if this improves more windows than it worsens.
+squares of a chessboard. The correction fitted to the squares of one colour warps those of the
+other. The step is kept only if this improves more windows than it worsens.
 """
 
 from __future__ import annotations
@@ -46,15 +46,16 @@ ALIGNMENT_SIDE_PX, ALIGNMENT_SIGMA_PX, ALIGNMENT_ITERATIONS = 480, 1.0, 15
 aligned. Chosen by hand."""
 
 IRLS_ITERATIONS = 30
-"""Maximum number of steps; a step that changes nothing ends the fit."""
+"""Maximum number of reweighting steps. The fit ends earlier if a step changes nothing. Chosen by
+hand."""
 
 NOISE_STD = 2.0
 """`normalise_local_contrast` adds the square of this number of grey levels to the variance of each
 window, so that noise is not amplified in flat windows. Chosen by hand."""
 
 SQUARES, STEP_PX = 8, WINDOW_PX // 3
-"""Number of squares of the chessboard along the longer side of a large image, and distance between
-the centres of the windows in which images are compared. Chosen by hand."""
+"""Number of squares of the chessboard along the longer side of a large image, and distance in
+pixels between the centres of the windows in which images are compared. Chosen by hand."""
 
 Fit = Callable[[np.ndarray], "np.ndarray | None"]
 """A function that fits a (3, 3) correction of a homography to the pixels in an (H, W) bool mask. It
@@ -82,7 +83,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
     steps.append(partial(_fit_to_pixels, gray0))
     current = np.asarray(homography, np.float64)
     for step in steps:
-        # Linear interpolation loses detail that tracking needs. Only the last step does not track.
+        # Tracking needs the detail that cubic interpolation keeps. The last step does not track.
         warp = partial(warp_to_reference, exact=step is steps[-1])
         warped, valid_mask = warp(gray1, current, size)
         fit = step(warped, valid_mask)
@@ -168,8 +169,8 @@ def fit_homography_irls(
 ) -> np.ndarray | None:
     """Fit a homography to (N, 2) points by iteratively reweighted least squares (Cauchy weights).
 
-    A point with a residual of `scale_px` has half the weight of one without. Returns None if the
-    points determine no homography. The last element of the result is 1.
+    A point with a residual of `scale_px` pixels has half the weight of a point without residual.
+    Returns None if the points determine no homography. The last element of the result is 1.
     """
     middle = points0.mean(axis=0)
     spread = float(np.abs(points0 - middle).mean())

@@ -1,12 +1,12 @@
-"""Errors of cameras and points reconstructed from synthetic facades with exactly known cameras.
+"""Measure errors of cameras that are reconstructed from images of synthetic facades.
 
     python benchmarks/made_scenes.py DATA [--scenes FOLDER]
 
-A scene is a wall with bumps and boxes, textured with photographs of DATA/photos/train. It is seen
-from 11 places along an arc of 56 degrees, 8 m away, in images of 1152x768 pixels with noise,
-varying brightness and JPEG compression. The script runs `deepdetect dev benchmark sfm` on three
-such scenes with different seeds. It prints the mean errors of camera centres, in mm, and of
-rotations, after the alignment of all centres.
+A scene is a wall with bumps and boxes, textured with photographs of DATA/photos/train. Cameras with
+exactly known poses see it from 11 places along an arc of 56 degrees, 8 m away, in images of
+1152x768 pixels with noise, varying brightness and JPEG compression. The script runs `deepdetect dev
+benchmark sfm` on three scenes with different seeds. It prints the mean errors of camera centres, in
+mm, and of rotations, after the alignment of all centres.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ SCENES, PLACES, ARC_DEG, DISTANCE_M = 3, 11, 56, 8.0
 WALL_M, TILE_PX, PIXELS_PER_M, CELLS_PER_M = (14, 9), 480, 240, 60
 WIDTH, HEIGHT, FOCAL_PX, SAMPLING = 1152, 768, 1209.6, 2
 NEAREST_M, FARTHEST_M, STEPS, BISECTIONS = -1.5, 1.2, 140, 14
-"""Range of depths relative to the plane of the wall, and steps of the search for the surface along
-each ray. All numbers of the scene are chosen by hand."""
+"""Range of depths relative to the plane of the wall, and numbers of steps and of bisections in the
+search for the surface along each ray. All numbers of the scene are chosen by hand."""
 
 
 def make_wall(rng: np.random.Generator, files: list[Path]) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +60,7 @@ def make_wall(rng: np.random.Generator, files: list[Path]) -> tuple[np.ndarray, 
 
 
 def look(grid: np.ndarray, x: np.ndarray, y: np.ndarray, per_m: int, border: int) -> np.ndarray:
-    """Interpolate a grid at positions on the wall, in metres."""
+    """Interpolate a grid with `per_m` cells per metre at positions on the wall, in metres."""
     at = [(each * per_m - 0.5).astype(np.float32) for each in (x, y)]
     return cv2.remap(grid, *at, cv2.INTER_LINEAR, borderMode=border)
 

@@ -1,4 +1,4 @@
-"""COLMAP's two mappers on synthetic drone flights with growing numbers of images.
+"""Compare COLMAP's two mappers on synthetic drone flights with growing numbers of images.
 
     python benchmarks/mappers.py [COUNT ...]
 
@@ -30,16 +30,16 @@ from deepdetect_lab.evaluation.profiling import peak_memory, run_in_child
 COUNTS = (60, 120, 250, 500, 1000)
 SIZE, FOCAL_PX, WRONG_FOCAL = (640, 480), 600.0, 1.03
 STEP, APART = 0.3 * SIZE[1], 0.4 * SIZE[0]
-"""Distance between images of a line, and between lines. The unit of length is the size of an
-image's pixel on the ground. Chosen for overlaps of 70 and 60 %."""
+"""Distance between the images of a flight line, and between lines. The unit of length is the size
+of a pixel on the ground. Chosen for overlaps of 70 % along lines and 60 % across them."""
 
 RELIEF, PLACE_NOISE, TILT_DEG, NOISE_PX = 36.0, 12.0, 4.0, 0.4
-"""Standard deviations of heights of the ground, positions and angles of cameras, and keypoints.
-Chosen by hand."""
+"""Standard deviations of the ground's heights and the cameras' positions, in pixels on the ground,
+of the cameras' angles, and of the keypoints' noise. Chosen by hand."""
 
 SEEN_POINTS, LOST, WRONG = 1500, 0.4, 0.4
-"""Number of points that an image shows; fractions of the matches of a pair that are lost, and of
-the others that are wrong. Chosen by hand."""
+"""Mean number of points that an image shows; fraction of the matches of a pair that are lost, and
+fraction of the remaining matches that are wrong. Chosen by hand."""
 
 
 def fly(count: int, rng: Generator) -> tuple[list[PosedView], list[np.ndarray], list[np.ndarray]]:
@@ -93,7 +93,7 @@ def write_flight(path: Path, count: int, rng: Generator) -> list[PosedView]:
 def measure(
     name: str, database: Path, truth: list[PosedView], verified: dict[Pair, int]
 ) -> tuple[object, ...]:
-    """Map a flight; must be called in a separate process.
+    """Reconstruct the cameras of a flight by a mapper. Call it in a separate process.
 
     Returns the number of registered images, the mean and the largest error of their centres in
     pixels on the ground, CPU seconds, and the peak memory of the process in megabytes.

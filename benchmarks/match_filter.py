@@ -1,18 +1,20 @@
-"""Correct matches by the learned match filter and by the ratio test, on the same points.
+"""Compare the learned match filter with the ratio test by correct matches, on the same points.
 
     python benchmarks/match_filter.py DATA
 
-DATA contains the folders oxford, hpatches, fountain, entry and the clips of KITTI. Images have
+DATA contains the folders oxford, hpatches, fountain, entry, kitti-clip and kitti-clip2. Images have
 2,048 keypoints, matched as mutual nearest neighbours. Counts are sums over all pairs.
 
-- A match is correct within 3 px of the homography (Oxford, HPatches), or within 1.5 px of the
-  ground-truth epipolar line (others), on which a wrong match may lie by chance.
+- A match is correct if its error is at most 3 px by the homography (Oxford, HPatches), or if its
+  Sampson distance from the true epipolar geometry is at most 1.5 px (fountain, entry, clips). By
+  chance, wrong matches may also be near their epipolar lines.
 - "as precise by ratio": the most correct matches by a ratio test that is at least as precise as the
   filter.
 - "pose": area under the curve of pose errors up to 5 degrees, a mean over five orders of the
   matches; 30 pairs of each clip.
 - "unrelated": matches between the first images of successive scenes of HPatches, all wrong.
-- "time": median processor time of matching one pair on one processor, relative to the ratio test.
+- "time": median processor time of matching one pair on one processor, divided by that of the ratio
+  test.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ NEAR_LINE_PX = 1.5
 """A correct match lies within this distance of its epipolar line, in pixels. Chosen by hand."""
 
 RATIOS = np.arange(0.4, 0.99, 0.02)
-"""Limits of the ratio test that are tried. Few matches would pass lower ones."""
+"""Thresholds of the ratio test that are tried. Few matches would pass lower thresholds."""
 
 Errors = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A function that returns the errors of (M, 2) matched positions in both images, in pixels."""

@@ -1,4 +1,4 @@
-"""Matching of images from different sensors and seasons, and of maps: answers and errors.
+"""Match images from different sensors and seasons, and maps; count correct and wrong answers.
 
     python benchmarks/modalities.py FOLDER [--method xfeat_2048_600x800.onnx ...]
 
@@ -6,9 +6,9 @@ FOLDER is Multimodal_Image_Matching_Datasets of the repository StaRainJ/Multi-mo
 matching-database-metrics-methods on GitHub. Each of its `*/*/*.mat` has two images, their
 homography and landmarks marked by hand. A match is correct within 5 px, or within three times the
 median error of the homography at the landmarks if that is more. "Answered" counts pairs for which
-`match_images` finds matches, "wrong" those of them with fewer than half of the matches correct. The
-other columns count the correct matches of all pairs, from 2,048 keypoints per image, matched as
-mutual nearest neighbours without a ratio test.
+`match_images` finds matches, "wrong" the answered pairs with fewer than half of the matches
+correct. The columns of other methods count the correct matches of all pairs, from 2,048 keypoints
+per image, matched as mutual nearest neighbours without a ratio test.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from deepdetect.geometry.transforms import transfer_errors, transform_points, tr
 from deepdetect_lab.evaluation.report import Row, Table
 
 RIGHT_PX, LANDMARK_ERRORS = 5.0, 3.0
-"""Limits of correct matches: in pixels, and in errors of landmarks. Chosen by hand."""
+"""Error limits of a correct match, of which the larger one holds: in pixels, and as a multiple of
+the landmarks' median error. Chosen by hand."""
 
 
 class ModalPair:
@@ -43,7 +44,7 @@ class ModalPair:
         found = loadmat(path)
         self.images = to_bytes(found["I_fix"]), to_bytes(found["I_move"])
         landmarks = [found["Landmarks"][name][0, 0] - 1.0 for name in ("LMfix", "LMmov")]
-        # MATLAB's matrix maps the second image to the first, as row vectors, with pixels from 1.
+        # MATLAB's matrix maps row vectors of the second image to the first; pixels count from 1.
         matrix = np.linalg.inv(found["T"].astype(np.float64).T)
         self.homography = translation_matrix(-1, -1) @ matrix @ translation_matrix(1, 1)
         off = np.median(
@@ -78,7 +79,7 @@ def measure(paths: Sequence[Path], files: Sequence[str]) -> Row:
             matches = match_images(*pair.images, detector)
             good = 2 * pair.right(matches) >= len(matches)
             answers.append((len(matches) > 0, matches.geometry.confidence == "high", good))
-        except ImageError:  # a round picture of a retina looks like one of a fisheye
+        except ImageError:  # a round picture of a retina counts as a fisheye picture
             answers.append((False, False, False))
         for name, extract in extractors.items():
             first, second = (extract(image) for image in pair.images)

@@ -1,10 +1,10 @@
-"""Matches of the Motorcycle pair with several options, and their precision.
+"""Match the Motorcycle pair with several options, and print the precision of the matches.
 
     python benchmarks/motorcycle_matching.py [--weights FILE]
 
 The pair comes with scikit-image. Precision is the share of matches within 1 px of the ground-truth
-disparity, where that is known; for all matches and for inliers of the geometry. The last row has as
-many random points as keypoints, for comparison.
+disparity, where that is known. It is printed for all matches and for inliers of the geometry. For
+comparison, the last row has as many random points as keypoints.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
-"""Time, memory and correct matches of the pipeline in the authors' notebooks and of ours.
+"""Compare our pipeline with that of the authors' notebooks: time, memory and correct matches.
 
     python benchmarks/published_pipeline.py DATA [--geometry-weights dense] [--rounds 5]
 
-DATA contains oxford/ and middlebury/. Both run end to end, from two images in memory to the count
-of correct matches (wall 1-6, graf 1-3, cones). For the points of both see `deepdetect dev benchmark
-middlebury`.
+DATA contains oxford/ and middlebury/. Both pipelines run end to end, from two images in memory to
+the count of correct matches (wall 1-6, graf 1-3, cones). `deepdetect dev benchmark middlebury`
+compares the points that both reconstruct.
 
-Published: torch without compilation, lists of `cv2.KeyPoint`, OpenCV's SIFT, FLANN, loops in
-Python. Ours: the default backend, dense RootSIFT, patchmatch, descriptors alone. Both use the same
-weights and take turns, on images squashed to 480x480; the first round compiles and is not counted.
+The published pipeline uses torch without compilation, lists of `cv2.KeyPoint`, OpenCV's SIFT, FLANN
+and loops in Python. Ours uses the default backend, dense RootSIFT and PatchMatch, without guided
+matching. Both use the same weights and take turns, on images squashed to 480x480. The first round
+compiles and is not counted.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--geometry-weights", default="dense", help="for stereo pairs")
+    parser.add_argument("--geometry-weights", default="dense", help="weights for the stereo pair")
     parser.add_argument("--rounds", type=int, default=5)
     arguments = parser.parse_args()
     scenes = load_oxford(arguments.data / "oxford")
@@ -76,7 +77,7 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def compare(published: Callable[[], int], ours: Callable[[], int], rounds: int) -> Row:
-    """Run both in turn; return median seconds, their ratios, median counts and peak memory."""
+    """Run both in turn; return median seconds, ratios, median counts and largest memory growth."""
     profiles: list[list[tuple[float, float]]] = []
     counts: list[list[int]] = []
     for turn in range(rounds + 1):
@@ -150,7 +151,7 @@ def _sides(
 
 
 def published_detector(detector: DeepDetect) -> DeepDetect:
-    """Return a detector with the same weights of the package, run by torch without compilation."""
+    """Return a detector with the same weights, which torch runs without compilation."""
     network = load_network(find_weights(detector.weights.stem))
 
     def run(image: np.ndarray) -> np.ndarray:

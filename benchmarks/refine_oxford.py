@@ -1,12 +1,12 @@
-"""More accurate homographies for Oxford, estimated from the images alone.
+"""Estimate more accurate homographies for Oxford from the images alone.
 
     python benchmarks/refine_oxford.py OXFORD OUTPUT
 
 Writes OUTPUT/SCENE/H1toKp.refined for homographies that are clearly better than the published ones,
-which are off by up to 26 px, and prints a table. OUTPUT may be OXFORD itself. Lucas-Kanade on the
-warped images (`homography_refinement`) starts from the published homography and from one
-by SIFT and MAGSAC, and the result with the highest correlation is taken. So no detector that the
-benchmark evaluates determines the result.
+which are off by up to 26 px, and prints a table. OUTPUT may be OXFORD itself. The refinement, by
+Lucas-Kanade tracking in warped images (`homography_refinement`), starts both from the published
+homography and from one estimated by SIFT and MAGSAC, and the result with the higher correlation is
+taken. So no detector that the benchmark evaluates determines the result.
 """
 
 from __future__ import annotations
@@ -33,16 +33,17 @@ from deepdetect_lab.evaluation.metrics.homography import project_visible
 from deepdetect_lab.evaluation.report import Row, Table
 
 CLEAR_GAIN = 0.01
-"""A larger gain in the median correlation suffices to accept a homography. Chosen by hand."""
+"""A homography is accepted if the median correlation rises by more than this. Chosen by hand."""
 
 CLEAR_MAJORITY = 0.6
-"""The correlation must rise in more than this fraction of the windows if the gain is smaller.
-Blurred or flat images gain little, since they correlate nearly as well when they are a pixel off. A
-gain can also come from a part of the image at the cost of the rest, as with lens distortion."""
+"""If the gain is at most `CLEAR_GAIN`, the correlation must rise in more than this fraction of the
+windows. Blurred or flat images gain little, since they correlate nearly as well when they are a
+pixel off. With lens distortion, one part of an image can gain while others lose. Chosen by hand."""
 
 MAX_APART = 0.5
 """Both starts count as converged to the same homography if their results differ by less than this
-fraction of the distance to the published one (medians over the overlap). Chosen by hand."""
+fraction of the distance between the better result and the published homography. Both distances are
+medians over the overlap. Chosen by hand."""
 
 COLUMNS = {
     "pair": "",
@@ -109,8 +110,9 @@ def _refine(pair: PlanarPair, path: Path) -> Row:
 def is_better(gain: float, moved: float, risen: float, apart: float | None) -> bool:
     """Return whether a refined homography is clearly better than the published one.
 
-    It is if its correlation is much higher, or if the correlation rises in a clear majority of the
-    windows and both starts converge to the same homography. Lengths are medians in pixels.
+    This holds if its correlation is much higher, or if the correlation rises in a clear majority of
+    the windows and both starts converge to the same homography. `moved` and `apart` are the medians
+    in pixels that `displacement` returns.
     """
     same = apart is not None and apart < MAX_APART * moved
     return gain > CLEAR_GAIN or (same and risen > CLEAR_MAJORITY)
@@ -135,7 +137,7 @@ def risen_fraction(
 ) -> float:
     """Return the fraction of the windows whose correlation rises.
 
-    Windows do not overlap. Those with equal correlation are left out.
+    Windows do not overlap. Windows whose correlation stays equal are left out.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
@@ -158,7 +160,7 @@ def displacement(
     size0: tuple[int, int],
     size1: tuple[int, int],
 ) -> tuple[float, float]:
-    """Return the distances between the pixels of the overlap when mapped by two homographies.
+    """Map the pixels of the overlap by two homographies; return distances between the results.
 
     Returns:
         The median and the largest distance in pixels; NaN without an overlap.

@@ -3,14 +3,15 @@
     python benchmarks/results.py DATA [--published FOLDER] [--only NAME ...] [--work build/results]
     python benchmarks/results.py [--check]
 
-The first line (`make results DATA=... ONLY=...`) runs the benchmarks, each with a cache, so that an
-interrupted run can continue. It writes `docs/results/NAME.csv`, and the command, commit, versions
-and machine of each result to `docs/results/index.json`. Some results need the authors' weights.
+The first command (`make results DATA=... ONLY=...`) runs the benchmarks, each with a cache, so that
+an interrupted run can continue. It writes `docs/results/NAME.csv`, and the command, commit,
+versions and machine of each result to `docs/results/index.json`. Some results need the authors'
+weights.
 
-The second line fills the blocks of the pages between `<!-- results:NAME -->` and
+The second command fills the blocks of the pages between `<!-- results:NAME -->` and
 `<!-- /results -->` from these files. `<!-- results:NAME first|second -->` chooses columns. A single
 cell in a sentence stands between `<!-- result:NAME|row|column -->` and `<!-- /result -->`. With
---check it only reports whether the blocks agree with the files.
+--check, the command only reports whether the blocks agree with the files.
 """
 
 from __future__ import annotations
@@ -86,13 +87,13 @@ STAGES = {
     "modalities": f"benchmarks/modalities.py {{data}}/multimodal{XFEAT}{E64}",
     "made-scenes": "benchmarks/made_scenes.py {data} --scenes {output}/scenes",
 }
-"""Arguments of Python by the name of the stage. Stages without a report print tables or JSON."""
+"""Python's arguments for each stage, by name. Stages without a report print tables or JSON."""
 
 TITLES: dict[str, str] = json.loads((RESULTS_FOLDER / "titles.json").read_text("utf-8"))
 """Shorter titles of rows, by their full titles."""
 
 OWN = ", own size and angle"
-"""Rows whose titles end like this become a column."""
+"""Rows whose titles end with this text become a column."""
 
 CLASSICAL = ("SIFT", "ORB", "BRISK", "FAST", "AGAST", "Harris", "Shi-Tomasi")
 
@@ -104,11 +105,11 @@ class Result:
     Attributes:
         stage: key of `STAGES`.
         table: key of the report's table, or the number of a printed table. A key that ends in *
-            means the rows of all tables whose keys begin like this; the rest of the key becomes a
-            cell of the row.
-        columns: by the title in the result: the title in the table, the number format, and
+            means the rows of all tables whose keys begin with the text before the *. The rest of
+            a table's key becomes a cell of its rows.
+        columns: maps a title in the result to the title in the table, the number format, and
             optionally the key of another table that has the column, and a suffix that names of
-            rows have there. Empty: all columns, with four digits.
+            rows have there. Empty: all columns, with four decimals.
         rows: only rows whose first or second cell begins with this text.
     """
 
@@ -361,7 +362,7 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
         subprocess.run([sys.executable, *words], check=True)
         return
     folder.mkdir(parents=True, exist_ok=True)
-    printed = folder / "printed.txt"  # saves hours of work if the stage or the parsing fails
+    printed = folder / "printed.txt"  # is kept if parsing fails, because stages take hours
     with printed.open("w") as stdout:
         subprocess.run([sys.executable, *words], check=True, stdout=stdout)
     text = printed.read_text()

@@ -1,4 +1,4 @@
-"""Rectified matching and OpenCV's semi-global matching: points, accuracy, time.
+"""Compare our rectified matching with OpenCV's semi-global matching: points, accuracy, time.
 
     python benchmarks/row_matching.py DATA
 
@@ -8,23 +8,23 @@ rows of each scene are:
 - keypoints: the disparity map at the keypoints of the `dense` weights;
 - every: the disparity map at every pixel, with default options;
 - edges: every pixel, also near disparity discontinuities;
-- parabola: as edges, but before `refine_disparity`: a parabola through the costs of three integer
-  disparities;
+- parabola: as edges, but without `refine_disparity`: disparities are the minima of parabolas
+  through the costs of three integer disparities;
 - dense: as edges, with occlusions filled;
 - matched: the pixels of dense that are not filled;
 - SGBM: OpenCV's, with the range of the ground truth, rounded up to a multiple of 16;
-- SGBM, framed: the same with both views padded on the left by that range, so that OpenCV also
+- SGBM, framed: as SGBM, but with both views padded on the left by that range, so that OpenCV also
   gives values where the right view shows nothing.
 
 The columns are: the number of points; the fraction of those with known ground truth that is within
 0.25, 0.5, 1, 2 and 4 px of it; completeness, which is the fraction of the pixels with known ground
 truth, including occluded ones, that have a point within 1 px; "tenths of a pixel"; and seconds. For
-"tenths of a pixel", the fractional parts of disparities are counted in ten bins, relative to the
-ground truth if that is not rounded. The smallest and the largest ratio are given; they are far from
-1 if the disparity map has terraces.
+"tenths of a pixel", the fractional parts of disparities are counted in ten bins, and each count is
+divided by that of the ground truth, unless the latter is rounded. The smallest and the largest
+ratio are given; they are far from 1 if the disparity map has terraces.
 
-The ground truth of dolls belongs to another view than its photographs, two baselines away. Its rows
-are given with the file's ground truth, and with the ground truth moved to the photographs' view.
+The ground truth of dolls belongs to a view that is two baselines away from its left photograph. Its
+rows are given with the ground truth of the file, and with that moved to the photograph's view.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ def main() -> None:
     """Print a table with a row for each scene and way."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of the scenes")
-    parser.add_argument("--repeats", type=int, default=3, help="the fastest counts (default: 3)")
+    parser.add_argument("--repeats", type=int, default=3, help="runs; the fastest one is taken")
     arguments = parser.parse_args()
     detector = DeepDetect("dense")
     rows: list[Row] = []
     for name, left, right, known in scenes(arguments.data):
         keypoints = detector.detect(left).xy
         for way, compute in ways(left, right, keypoints, search_count(known)).items():
-            compute()  # the first one compiles
+            compute()  # the first call compiles
             seconds = []
             for _ in range(arguments.repeats):
                 started = time.perf_counter()

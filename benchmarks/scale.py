@@ -1,12 +1,13 @@
-"""Cost of features, pairs and matches for growing synthetic collections, on a Ray cluster.
+"""Measure the cost of features, pairs and matches of growing collections on a Ray cluster.
 
     python benchmarks/scale.py PHOTOGRAPHS [COUNT ...] [--work FOLDER]
 
-Each photograph below a folder stands for a place, of which 34 synthetic images are made: with
-random perspective and brightness, small and with few keypoints, so that 100,000 of them take two
-hours on two cores. Then `extract_features`, the search for similar pairs and `match_pairs` run on a
-cluster that is started here. CPU time is that of all processes, including Ray's own. Memory is
-given for the calling process and for the largest of the others, a worker. Needs the group `ray`.
+Each photograph in PHOTOGRAPHS or its subfolders stands for a place, of which 34 synthetic images
+with random perspective and brightness are made. They are small and have few keypoints, so that
+100,000 of them take two hours on two cores. Then `extract_features`, the search for similar pairs
+and `match_pairs` run on a cluster that this script starts. CPU time is that of all processes,
+including Ray's own. Memory is given for the calling process and for its largest child process, a
+worker. The script needs the dependency group `ray`.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ VIEWS = 34
 SIZE = (320, 240)
 POINTS = 256
 SHRUNK, SHIFTED = 0.8, 0.1
-"""The frame of a view has the first fraction of the photograph's shorter side. Each corner is moved
-by up to the second fraction of the frame. Chosen by hand."""
+"""The longer side of a view's frame is the fraction `SHRUNK` of the photograph's shorter side. Each
+corner moves in x and y by up to the fraction `SHIFTED` of that longer side. Chosen by hand."""
 
 COLUMNS = {
     "images": ",d",
@@ -77,7 +78,7 @@ def make_images(task: tuple[Path, Path, int]) -> None:
 
 
 class Watch(threading.Thread):
-    """Measures the CPU seconds of this process and its children, and the largest child's memory."""
+    """A thread that measures CPU seconds of all processes and the memory of the largest child."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -103,7 +104,7 @@ class Watch(threading.Thread):
 
 
 def watched(work: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
-    """Run a function and measure it; must be called in a separate process."""
+    """Run a function, and measure its CPU seconds and memory. Call it in a separate process."""
     watch, before = Watch(), time.process_time()
     watch.start()
     found = work(*arguments)

@@ -1,14 +1,14 @@
-"""README's code: `DeepDetectFeature2D` in place of `cv2.SIFT` before `cv2.BFMatcher`.
+"""Compare `DeepDetectFeature2D` with `cv2.SIFT`, matched by `cv2.BFMatcher` as in the README.
 
     python benchmarks/swap.py DATA
 
-DATA contains the folders fountain and entry. All pairs of images up to 4 apart are matched with
-`crossCheck`. A match is correct if its Sampson distance from the epipolar lines is below 1.5 px.
+DATA contains the folders fountain and entry. All pairs of images up to 4 positions apart are
+matched with `crossCheck`. A match is correct if its Sampson distance is below 1.5 px.
 
-- limit: at most so many keypoints per image, for both methods; none: the methods' own defaults.
-- SIFT, ours: number of correct matches of all pairs. ratio, least: their ratio, and that of the
-  worst pair. keypoints: mean number of ours, divided by SIFT's.
-- time: median processor time of `detectAndCompute` per image, divided by SIFT's.
+- limit: maximum number of keypoints per image for both methods; none: the methods' own defaults.
+- SIFT, ours: number of correct matches of all pairs. ratio, least: ours divided by SIFT's, for all
+  pairs and for the worst pair. keypoints: mean number of ours, divided by that of SIFT.
+- time: processor time of our `detectAndCompute`, divided by SIFT's; median over the images.
 """
 
 from __future__ import annotations

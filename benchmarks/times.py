@@ -1,12 +1,12 @@
-"""Time, repeatability and matches of keypoints with descriptors, for many methods.
+"""Measure time, repeatability and matches of many methods for keypoints with descriptors.
 
     python benchmarks/times.py DATA --cache FOLDER [--method xfeat.onnx --method edgepoint2.onnx]
 
-Time: from an image of 800x600 in memory (the only size that XFeat's file takes) to at most 2,048
-keypoints with descriptors. It is the median over rounds, in which all methods take turns, in a
-process with one or two processors. SIFT and ORB with their own descriptors detect and describe in
+Times are from an image of 800x600 in memory (the only size that XFeat's file takes) to at most
+2,048 keypoints with descriptors. They are medians over rounds, in which all methods take turns, in
+a process with one or two processors. SIFT and ORB with their own descriptors detect and describe in
 one call. Repeatability and correct matches are means over the 40 pairs of Oxford, as in the
-standard protocol; the cache keeps them.
+standard protocol, and are kept in the cache.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ TOGETHER = {"SIFT": "SIFT_create", "ORB": "ORB_create"}
 """Methods of OpenCV that compute keypoints and their own descriptors in one call."""
 
 RUNTIMES = {"openvino": "", "onnxruntime": ", ONNX Runtime"}
-"""What the titles of columns add for each runtime."""
+"""End of the columns' titles for each runtime."""
 
 THREADS = {1: "1 thread", 2: "2 threads"}
 
@@ -65,11 +65,11 @@ MEASURES = {
     "right at 1 px": (("correct", 1), ",.0f"),
     "right at 3 px": (("correct", 3), ",.0f"),
 }
-"""Columns, each with its name in the rows of the standard protocol and its number format."""
+"""Title of each column, with its key in the rows of the standard protocol and number format."""
 
 
 def networks(files: Sequence[str], runtime: str, threads: int | None) -> list[LocalFeature]:
-    """Return the networks of others, from files, and ours, whose best pixels are the keypoints."""
+    """Return others' networks from files, and ours with the most probable pixels as keypoints."""
     selection = SelectionOptions(max_keypoints=MATCHING_BUDGET, nms_radius=1, subpixel=True)
     ours = []
     for weights in WEIGHTS:
@@ -81,7 +81,7 @@ def networks(files: Sequence[str], runtime: str, threads: int | None) -> list[Lo
 
 
 def classical() -> list[LocalFeature]:
-    """Return the methods that need no runtime."""
+    """Return the methods that run neither in ONNX Runtime nor in OpenVINO."""
     detector = PointDetector(MATCHING_BUDGET, resolution="native")
     version = str(detector.settings)
     points = replace(points_feature(), detect=detector.detect, version=version, detection="")
@@ -90,7 +90,7 @@ def classical() -> list[LocalFeature]:
 
 
 def described(features: Sequence[LocalFeature]) -> list[LocalFeature]:
-    """Return the features once with each of their descriptors, which are named in the titles."""
+    """Return each feature once with each of its descriptors, which are named in the titles."""
     rows = []
     for feature in features:
         if feature.learned or feature.title in TOGETHER:
@@ -128,7 +128,7 @@ def extract(feature: LocalFeature, image: np.ndarray) -> np.ndarray:
 
 
 def on_processors(count: int, function: Callable[..., Row], *arguments: object) -> Row:
-    """Call a module's function in a process that may use `count` processors from its start."""
+    """Call a module-level function in a new process that may use only `count` processors."""
     all_of_them = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(all_of_them)[:count])
     context = multiprocessing.get_context("spawn")

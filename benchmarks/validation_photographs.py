@@ -1,10 +1,11 @@
-"""Score weights and their calibration on the validation photographs of a training.
+"""Score weights and their calibration on the validation photographs of a training run.
 
     python benchmarks/validation_photographs.py PHOTOS --weights default [--weights espnet ...]
 
-The views, the darkening and the labels are those of `deepdetect train --validation PHOTOS`: in
-normal light, and darkened with the labels of low visibility. BCE and IoU are means over
-photographs; calibration error (Naeini et al., 2015) and densities are computed over all pixels.
+The views, the darkening and the labels are those of `deepdetect train --validation PHOTOS`. Each
+photograph is scored in normal light, and darkened with the labels for low visibility. BCE and IoU
+are means over photographs; calibration error (Naeini et al., 2015) and densities are computed over
+all pixels.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from deepdetect_lab.training.views import SourceImage, label_view, list_images, 
 
 
 def main() -> None:
-    """Measure and print."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photographs", type=Path)
     parser.add_argument("--weights", action="append", required=True, help="name or file")
-    parser.add_argument("--short-side", type=int, default=480, help="in pixels (default 480)")
-    parser.add_argument("--every", type=int, default=1, help="take every n-th (default 1: all)")
+    parser.add_argument("--short-side", type=int, default=480, help="of the views, in pixels")
+    parser.add_argument("--every", type=int, default=1, help="use every n-th photograph")
     arguments = parser.parse_args()
     options = options_of(arguments.short_side)
     images = list_images(arguments.photographs, options, ())[:: arguments.every]
@@ -50,7 +51,7 @@ def main() -> None:
 
 
 def options_of(short_side_px: int) -> TrainingOptions:
-    """Return the options of a training that is validated at a given size."""
+    """Return the options of a training with validation images of a given shorter side."""
     return TrainingOptions(stages=(Stage(16, 1, 1),), short_sides=(short_side_px,))
 
 

@@ -1,9 +1,9 @@
-"""Render the second image of the page's example of forward motion.
+"""Render the second image of the app's example of forward motion.
 
     python tools/forward_example.py
 
-It shows the left view of the motorcycle (Middlebury 2014, in scikit-image) from a camera that moved
-forward. Each pixel is moved according to its measured depth; pixels that stay empty are inpainted.
+The image shows the left view of the motorcycle (Middlebury 2014, in scikit-image) as seen from a
+camera that moved forward. Each pixel moves according to its true depth. Empty pixels are inpainted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ AHEAD = 0.16
 """The camera moves forward by this fraction of the depth of the nearest point. Chosen by hand."""
 
 FOCAL_PX, CENTRE, OFFSET_PX = 994.978, (311.193, 254.877), 31.086
-"""Middlebury's calibration at this size: the left camera, and the difference of cx."""
+"""Middlebury's calibration at the size of the pair, in pixels: focal length and principal point of
+the left camera, and difference of the two cameras' cx."""
 
 SCALE = 4
 """The image is enlarged by this factor before pixels are moved, so that magnified parts have no

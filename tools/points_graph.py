@@ -7,9 +7,9 @@ The first command writes the package's file that `deepdetect export onnx` adds t
 second one writes the file that the page in the browser runs. Steps, constants and weights are those
 of `deepdetect.detector.points`: after a change there, write the package's file again.
 
-On processors with bfloat16, OpenVINO computes convolutions and products of matrices in it, and all
-that they need; the rest before an output stays in float32. So the graph has neither, except for one
-product of zeros and ones.
+On processors with bfloat16, OpenVINO computes convolutions, matrix products and the nodes before
+them in bfloat16, and only the remaining nodes in float32. So the graph has no convolutions, except
+for transposed ones, and only one matrix product, whose inputs are zeros and ones.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ OPSET, IR_VERSION = 17, 8
 """Versions of the operators and of the format, as in the network's file."""
 
 LUMA, LUMA_UNIT = (9798.0, 19235.0, 3735.0), 32768.0
-"""Weights of red, green and blue in OpenCV's luma, as integers over a unit: their sums are
-exact."""
+"""Weights of red, green and blue in OpenCV's luma. They are integers, so that sums are exact, and
+the sum is divided by the unit."""
 
 REACH_PER_SIGMA = 4
 """Radius of OpenCV's float32 Gaussian filters, in sigmas."""
@@ -66,16 +66,19 @@ FIRST, LAST = 1, len(SIGMAS_PX) - 3
 """First and last level that has candidates."""
 
 MARGIN = int(NMS_RADII.max()) + 1
-"""Radius of the patch around a candidate that is read: a window and one pixel for derivatives."""
+"""Radius in pixels of the patch that is read around a candidate: that of the largest window of
+non-maximum suppression, plus one pixel for derivatives."""
 
 NEAR, OTHERS = np.arange(-1, 3), [0, 2, 3]
-"""Levels that are read, relative to a candidate's own; indices of those that are not its own."""
+"""Levels that are read, relative to a candidate's own level; indices in `NEAR` of other levels."""
 
 CHUNK = 2048
-"""Number of candidates measured at once: all their patches would take 70 MB and more."""
+"""Number of candidates that are measured at once, because the patches of all candidates would take
+70 MB and more."""
 
 TOGETHER = 16
-"""Number of neighbours that a convolution smooths at once, as its channels."""
+"""Number of neighbouring pixels that a convolution smooths at once, as its channels. Chosen by
+hand."""
 
 BLOCK = 256
 """Number of points that are compared with each other at once. Chosen by hand."""
@@ -113,7 +116,7 @@ def points_model() -> onnx.ModelProto:
 
 
 def candidates_model() -> onnx.ModelProto:
-    """Make the graph that maps grey images to ranked candidates, at most an input `limit`."""
+    """Make the graph that maps grey images and a number `limit` to at most `limit` candidates."""
     graph = Graph(PREFIX)
     gray, limit = Tensor(graph, "gray").Cast(to=FLOAT), Tensor(graph, "limit")
     x, y, level, logits = rank_candidates(scale_space(gray), limit)
@@ -148,7 +151,7 @@ class Graph:
         self.constants: dict[Any, onnx.TensorProto] = {}
 
     def constant(self, value: Any, name: str | None = None) -> Tensor:
-        """Return a constant of float32, int64 or bool; equal ones without a name are shared."""
+        """Return a constant of float32, int64 or bool; equal unnamed constants are shared."""
         array = np.asarray(value)
         array = array.astype({"f": np.float32, "b": np.bool_}.get(array.dtype.kind, np.int64))
         key = name or (array.dtype, array.shape, array.tobytes())
@@ -162,7 +165,7 @@ class Graph:
         return Tensor(self, value.name) if isinstance(value, Tensor) else self.constant(value)
 
     def add(self, kind: str, *inputs: Any, outputs: int = 1, **values: Any) -> Any:
-        """Add a node, unless an equal one exists; return its output, or a list of several."""
+        """Add a node, unless an equal one exists; return its output, or a list of its outputs."""
         read = [self.tensor(value).name for value in inputs]
         key = kind, *read, repr(values)
         if key not in self.made:
@@ -222,11 +225,12 @@ def gray_of(image: Any) -> Any:
 
 
 class Levels(NamedTuple):
-    """Scale space of images, whose mean is (B, 1, 1, 1).
+    """Scale space of images.
 
-    `flat` holds all levels of an image in one row. Each is padded by `MARGIN`, mirrored at its
-    outermost rows and columns, as in the filters. `starts`, `heights` and `widths` are (L,): the
-    first index in `flat`, and the sides without padding. `frames` are the padded levels themselves.
+    `mean` is the images' mean grey level, (B, 1, 1, 1). `flat` holds all levels of an image in one
+    row. Each level is padded by `MARGIN`, mirrored at its outermost rows and columns, as in the
+    filters. `starts`, `heights` and `widths` are (L,): each level's first index in `flat`, and its
+    sides without padding. `frames` are the padded levels as images.
     """
 
     mean: Any
@@ -241,7 +245,7 @@ class Levels(NamedTuple):
         return Levels(*(graph.tensor(each) for each in self[:-1]), [])
 
     def places(self, level: Any, row: Any, column: Any) -> tuple[Any, Any]:
-        """Return the indices in `flat` of pixels, and the steps from each row to the next."""
+        """Return the indices of pixels in `flat`, and the distances in `flat` between rows."""
         stride = self.widths.Gather(level) + 2 * MARGIN
         return self.starts.Gather(level) + stride * (row + MARGIN) + (column + MARGIN), stride
 
@@ -254,7 +258,7 @@ def scale_space(gray: Any) -> Levels:
     for k, sigma in enumerate(SIGMAS_PX):
         height, width = (smooth.Shape(start=axis, end=axis + 1) for axis in (2, 3))
         if OCTAVES[k] > octave:
-            # After slices up to `END` by steps, OpenVINO 2026.4 confuses sides (request 37932).
+            # After slices with steps up to `END`, OpenVINO 2026.4 confuses sides (request 37932).
             smooth = smooth.Slice([0], height, [2], [2]).Slice([0], width, [3], [2])
             height, width = (smooth.Shape(start=axis, end=axis + 1) for axis in (2, 3))
             octave = OCTAVES[k]
@@ -323,22 +327,19 @@ def _peaks(levels: Levels, k: int) -> Any:
 
 
 def _framed(values: Any, radius: int, axis: int, side: Any, more: Any = 0) -> Any:
-    """Pad images by mirrored rows (axis 2) or columns (axis 3).
-
-    `more` is the number of additional ones at the end.
-    """
+    """Pad images by `radius` mirrored rows (axis 2) or columns (axis 3); at the end add `more`."""
     graph, period = values.graph, (side * 2 - 2).Max([1])
     ends = (-radius, 0), (side.Squeeze(), (side + radius + more).Squeeze())
     places = (graph.add("Range", *end, 1).Mod(period) for end in ends)
     before, after = (values.Gather(each.Min(period - each), axis=axis) for each in places)
-    return graph.join([before, values, after], axis=axis)  # copies most values in long rows
+    return graph.join([before, values, after], axis=axis)  # copies `values` in long rows
 
 
 def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
     """Smooth images as `cv2.GaussianBlur` does.
 
-    Convolutions with one channel are slow, so `TOGETHER` neighbours are channels. The convolutions
-    are transposed, because OpenVINO would round others to bfloat16.
+    Convolutions with one channel are slow, so `TOGETHER` neighbours become channels. Transposed
+    convolutions are used, because OpenVINO would round others to bfloat16.
     """
     graph, radius = values.graph, round(2 * REACH_PER_SIGMA * sigma + 1) // 2
     kernel = cv2.getGaussianKernel(2 * radius + 1, float(sigma), cv2.CV_32F)[:, 0]
@@ -347,12 +348,12 @@ def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
     numbers = np.arange(TOGETHER)
     within = graph.constant(numbers[:, None, None] - numbers[:, None] + TOGETHER - 1)
     beyond = TOGETHER * (more + 2) - 1 - len(kernel)
-    table = graph.constant(np.pad(kernel, (TOGETHER - 1, beyond)))  # small in a file
+    table = graph.constant(np.pad(kernel, (TOGETHER - 1, beyond)))  # takes little space
     weights = table.Gather(within + TOGETHER * np.arange(more, -1, -1))
     for axis, side in ((3, width), (2, height)):
         missing = (side * -1).Mod([TOGETHER]) + (TOGETHER * more - 2 * radius)
         blocks = _framed(values, radius, axis, side, missing)
-        # One side in blocks: to (B, TOGETHER, H, W) and back.
+        # The side is divided into blocks, (B, TOGETHER, H, W), smoothed, and joined again.
         if axis == 3:
             blocks = blocks.Squeeze([1]).Reshape([0, 0, -1, TOGETHER]).Transpose(perm=[0, 3, 1, 2])
             shape, crop, order, whole = (1, -1), [0, more], [0, 2, 3, 1], [0, 0, -1]
@@ -439,7 +440,7 @@ def _measure(levels: Levels, level: Any, row: Any, column: Any, ranks: Any) -> t
 
     ring = 21 + 8 * np.arange(len(RING_RADII))
     area = (levels.heights * levels.widths).Slice([0], [1])
-    features = {  # by their columns
+    features = {  # keys: columns of the ranker's input
         (0,): (own + 9.0) / 3.0,
         (1, 2, 3): (others - own) / 2.0,
         (4,): own_determinant.Sign(),
@@ -468,13 +469,13 @@ def _measure(levels: Levels, level: Any, row: Any, column: Any, ranks: Any) -> t
 
 
 def _at(values: Any, margin: int, down: int, right: int) -> Any:
-    """Return the neighbours, in axes 2 and 3, of all pixels that are not in the margins."""
+    """Return the neighbours at (down, right) of pixels that are not in the margins (axes 2, 3)."""
     start, stop = np.add(margin, (down, right)), np.subtract((down, right), margin)
     return values.Slice(start, np.where(stop, stop, END), [2, 3])
 
 
 def _bends(values: Any, margin: int) -> tuple[Any, Any]:
-    """Return the second differences in x and in y."""
+    """Return the second differences in x and in y of all pixels that are not in the margins."""
     double = _at(values, margin, 0, 0) * 2.0
     xx = (_at(values, margin, 0, -1) - double) + _at(values, margin, 0, 1)
     yy = (_at(values, margin, -1, 0) - double) + _at(values, margin, 1, 0)
@@ -495,14 +496,14 @@ def _log(determinant: Any) -> Any:
 
 
 def _log_slope(values: Any, margin: int, variance: Any) -> Any:
-    """Return the logarithm of the squared gradient."""
+    """Return the logarithm of the squared gradient, normalised by the level's variance."""
     dx = _at(values, margin, 0, 1) - _at(values, margin, 0, -1)
     dy = _at(values, margin, 1, 0) - _at(values, margin, -1, 0)
     return ((dx * dx + dy * dy) * (variance * 0.25) + GRADIENT_FLOOR).Log()
 
 
 def _peak_offsets(response: Any) -> list[Any]:
-    """Return the offsets in x and y of maxima from the centres of windows, as `refine_peaks`."""
+    """Return the offsets in x and y of maxima from window centres, as `refine_peaks` does."""
     near = [[_at(response, MARGIN - 1, j, i) for i in (-1, 0, 1)] for j in (-1, 0, 1)]
     dx, dy = (near[1][2] - near[1][0]) * 0.5, (near[2][1] - near[0][1]) * 0.5
     xx = (near[1][0] - near[1][1]) + (near[1][2] - near[1][1])
@@ -525,16 +526,16 @@ def _rank(graph: Graph, features: dict[tuple[int, ...], Any]) -> Any:
     values = values.Clip(-MAX_DEVIATIONS, MAX_DEVIATIONS)
     for k, (weight, bias) in enumerate(ranker.layers):
         values = values.Relu() if k else values
-        # A product of matrices, which OpenVINO would round to bfloat16 if it were written as one.
+        # This is a matrix product, but OpenVINO would round the inputs of MatMul to bfloat16.
         weight = (weight if k else weight[:, order]).T[:, :, None]
         values = values.ConvTranspose(weight) + bias[:, None]
     return (values + features[0,]).Squeeze([1])
 
 
 def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
-    """Keep candidates, best first, that are not near a better kept one.
+    """Keep candidates that are not near a better candidate that is kept.
 
-    Returns x, y, scores, sizes and levels of the first kept ones, (B, `count`) each.
+    Returns x, y, scores, sizes and levels of the `count` best kept ones, (B, `count`) each.
     """
     graph = x.graph
     logits, order = logits.TopK(logits.Shape(start=1), axis=1, outputs=2)
@@ -567,7 +568,7 @@ def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
         better = better * _near(here, here)
 
         def settle(_: Any, __: Any, kept: Any) -> tuple[Any, Any]:
-            """Keep those whose better neighbours are all suppressed, until nothing changes."""
+            """Keep points whose better neighbours are all suppressed, until nothing changes."""
             first, near = (kept.graph.tensor(each) for each in (free, better))
             settled = near.MatMul(kept.Cast(to=FLOAT)).Greater(0.0).Where(0.0, first)
             settled = settled.Cast(to=INT64)
@@ -581,7 +582,7 @@ def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
         found = (found + kept.ReduceSum([1])).Min(count)
         return found.Less(count).Cast(to=FLOAT).ReduceMax(keepdims=0).Cast(to=BOOL), rows, found
 
-    # Rows of the kept candidates, padded by the last row, which is padding; and their number.
+    # Indices of the kept candidates, filled up with the last index (padding), and their number.
     images = x.Shape(end=1)
     rows = last.Expand(graph.join([images, count + 1], axis=0))
     found = graph.tensor([[0]]).Expand(graph.join([images, [1]], axis=0))

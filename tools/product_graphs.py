@@ -1,8 +1,8 @@
-"""Write the ONNX files of one node with which matchers multiply descriptors.
+"""Write the ONNX files, each with one node, with which matchers multiply descriptors.
 
     python tools/product_graphs.py
 
-Each maps a (n, d) and b (d, m) to y (n, m).
+Each file multiplies the matrices a (n, d) and b (d, m), and returns their product y (n, m).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ GRAPHS = {
     "signed": ("MatMulInteger", TensorProto.UINT8, TensorProto.INT8, TensorProto.INT32),
     "unsigned": ("MatMulInteger", TensorProto.UINT8, TensorProto.UINT8, TensorProto.INT32),
 }
-"""Operator, and types of a, b and y, by file name."""
+"""Operator and types of a, b and y for each file, keyed by its name."""
 
 
 def product_graph(name: str) -> ModelProto:
-    """Make the graph of this name."""
+    """Make the ONNX model for a name from `GRAPHS`."""
     operator, *types = GRAPHS[name]
     shapes = (("a", ["n", "d"]), ("b", ["d", "m"]), ("y", ["n", "m"]))
     a, b, y = (

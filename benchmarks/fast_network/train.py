@@ -1,12 +1,12 @@
-"""Train the network `fast` for some CPU seconds, on views that `views.py` makes at the same time.
+"""Train `FastNetwork` for some CPU seconds, on views that `views.py` makes at the same time.
 
     python benchmarks/fast_network/train.py VIEWS OUTPUT SECONDS [--init WEIGHTS] [--rate 0.002]
 
 The recipe is that of `deepdetect train` without files of labels: SOAP, bfloat16, batches of 16
-views of 480 pixels or the same number of pixels in other sizes, and one cosine. The weights are an
-exponential average. It prints steps, seen pixels in images of 480x480, seconds, learning rate,
-loss, BCE and IoU over every fourth validation photograph in normal light and darkened, and the
-number of views made so far.
+views of 480x480 pixels or of about as many pixels in other sizes, and a learning rate that falls
+by one cosine. The written weights are an exponential moving average. The script prints steps, seen
+pixels in units of 480x480, CPU seconds, learning rate, loss, BCE and IoU over every fourth
+validation photograph in normal light and darkened, and the number of views made so far.
 
 The weights `default` come from two runs on 2,705 photographs (29,703 views). The first run took
 5,400 s of one thread (AMD EPYC with bfloat16, shared with other work). It began with the weights of
@@ -41,8 +41,8 @@ SHARES = {"S": 0.14, "T": 0.12, "M": 0.62, "L": 0.12}
 """Batch size, and share of the batches, for each size of views. Chosen by hand."""
 
 KINDS = np.array([0.26, 0.20, 0.32, 0.22])
-"""Shares of views that are unchanged, darkened, augmented, and both; missing kinds get none. Chosen
-by hand."""
+"""Shares of views that are unchanged, darkened, augmented, and both darkened and augmented. Kinds
+without views are left out. Chosen by hand."""
 
 WARM_UP, DECAY = 0.04, 0.999
 """Fraction of the training over which the rate rises, and decay of the average of the weights in

@@ -1,10 +1,10 @@
-"""Make labelled views until it is stopped, for a training that runs at the same time.
+"""Make labelled views for a training that runs at the same time, until the process is stopped.
 
-    views.py PHOTOS VALIDATION OUTPUT WORKERS [--labels dense]
+    python benchmarks/fast_network/views.py PHOTOS VALIDATION OUTPUT WORKERS [--labels dense]
 
-It writes chunks of (N, 2, S, S) uint8: luma and label of whole views of four sizes, since the
-thresholds of a label depend on the whole image. `dense` labels are for normal light only. The
-weights `free` are trained on the data set `photographs-free`.
+The script writes chunks of (N, 2, S, S) uint8: luma and label of views of four sizes. Views are
+whole images, since the thresholds of a label depend on the whole image. `dense` labels are for
+normal light only. The weights `free` are trained on the data set `photographs-free`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ CHUNKS = {"S": 16, "T": 16, "M": 8, "L": 2}
 SMALL = (0.2, 0.1, 0.4, 0.3)
 KINDS = {"S": SMALL, "T": SMALL, "M": (0, 0.3, 0.42, 0.28), "L": (0.45, 0.25, 0.18, 0.12)}
 NORMAL_KINDS = (0.4, 0, 0.6, 0)
-"""Shares of views that are unchanged, darkened, augmented, and both. All shares and sizes are
-chosen by hand."""
+"""Shares of views that are unchanged, darkened, augmented, and both darkened and augmented, if
+labels are `dense`; `KINDS` has the shares for other labels. All shares and sizes are chosen by
+hand."""
 
 
 def labelled(rgb: np.ndarray, dense: bool) -> np.ndarray:

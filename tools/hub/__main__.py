@@ -1,9 +1,9 @@
-"""Write folders of the weights for model hubs: card, config, ONNX and safetensors of each.
+"""Write a folder for model hubs for each set of weights: card, config, ONNX and safetensors.
 
     python tools/hub dist/hub
 
-`DeepDetect.from_pretrained(folder)` reads the folders of networks. So does transformers with
-`trust_remote_code`, by the code in modeling_deepdetect.py. Nothing is uploaded.
+`DeepDetect.from_pretrained(folder)` reads the folders of networks. transformers also reads them
+with `trust_remote_code`, by the code in modeling_deepdetect.py. Nothing is uploaded.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PREPROCESSOR = {
 
 
 def write_folder(folder: Path, card: Path, files: dict[str, Path], config: dict[str, Any]) -> None:
-    """Write the folder of a model; the links in its card are made absolute."""
+    """Write the folder of a model, with absolute links in its card."""
     hook = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
     assert hook is not None
     assert hook.loader is not None

@@ -20,7 +20,7 @@ STRIDE = 8
 """The network's input has sides that are multiples of this many pixels."""
 
 LOGIT_OUTSIDE = -100.0
-"""Logit of padding next to smaller images of a batch: the probability is 0."""
+"""Logit of the padding of smaller images in a batch. Its probability is 0."""
 
 
 class DeepDetectConfig(PreTrainedConfig):
@@ -28,7 +28,7 @@ class DeepDetectConfig(PreTrainedConfig):
 
     Args:
         keypoint_threshold: pixels with a higher probability become keypoints.
-        max_keypoints: number of keypoints, the best ones. None: all.
+        max_keypoints: only this number of the most probable keypoints is returned. None: all.
         nms_radius: radius of non-maximum suppression in pixels (0: none).
     """
 
@@ -177,8 +177,8 @@ class DeepDetectImageProcessor(BaseImageProcessor):
             target_sizes: (height, width) of each image, before any processing.
 
         Returns:
-            For each image "keypoints" (N, 2), x and y in pixels, the centre of the first pixel
-            (0, 0), and "scores" (N,).
+            For each image "keypoints" (N, 2), x and y in pixels, where the centre of the first
+            pixel is (0, 0), and "scores" (N,).
         """
         results = []
         parts = (outputs.keypoints, outputs.scores, outputs.mask > 0, target_sizes)

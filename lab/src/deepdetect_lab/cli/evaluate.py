@@ -259,9 +259,10 @@ def benchmark(
             [default: all except degraded]
         method: A further method: NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
         baselines: Classical methods, separated by commas, or none. [default: all]
-        preset: "published" gives the network BGR images, as the paper's code does; "default" RGB.
+        preset: "published" gives the network BGR images, as the paper's code does; "default" gives
+            it RGB images.
         cache: Folder for cached results.  [default: the folder cache in the output]
-        geometry_weights: Weights (name, file) for stereo pairs; may be repeated. [default: dense]
+        geometry_weights: Weights (name or file) for stereo pairs; may be repeated. [default: dense]
     """
     output = cli.output_folder(output)
     if values.get("resolution") not in (None, "auto", "native"):

@@ -27,7 +27,7 @@ CHUNK_BYTES = 1 << 16
 """Downloads are written in blocks of this many bytes. An interruption loses at most one block."""
 
 TIMEOUT_SECONDS = 60.0
-"""A host is given up if it sends no bytes for this time. Chosen by hand; not measured."""
+"""A download from a host fails if no byte arrives for this time. Chosen by hand; not measured."""
 
 ARCHIVE_SUFFIXES = (".zip", ".tar.gz", ".tgz", ".tar")
 
@@ -35,7 +35,7 @@ WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
     *(errno.EMFILE, errno.ENFILE),
 )
-"""Error numbers of the disk or system. Any other error in unpacking means a damaged archive."""
+"""Numbers of errors of the disk or system. Other errors in unpacking mean a damaged archive."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
     part = _part(path)
     for k, url in enumerate(file.urls):
         if k and file.checksum is None:
-            part.unlink(missing_ok=True)  # the bytes so far may not fit this host's file
+            part.unlink(missing_ok=True)  # this host's file may differ from the previous one's
         try:
             _fetch(url, file, part, quiet)
             if file.checksum is not None and not has_checksum(part, file.checksum):
@@ -181,7 +181,7 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
 
 
 def has_checksum(path: Path, checksum: str) -> bool:
-    """Whether the checksum of a file is the given one, such as "sha256:..." or "md5:..."."""
+    """Return whether a file has the given checksum, such as "sha256:..." or "md5:..."."""
     algorithm, _, digest = checksum.partition(":")
     with path.open("rb") as file:
         return hashlib.file_digest(file, algorithm).hexdigest() == digest

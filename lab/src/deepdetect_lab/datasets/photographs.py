@@ -32,7 +32,8 @@ from .download import RemoteFile
 
 CROP_SIDE_PX = 480
 JPEG_QUALITY = 97
-"""JPEG quality of the crops: its errors are smaller than image noise, so labels hardly change."""
+"""JPEG quality of the crops. Compression then changes pixels less than image noise does, so labels
+hardly change."""
 
 VALIDATION_SHARE = 1 / 20
 
@@ -98,7 +99,7 @@ class Crop:
 
     @property
     def is_free(self) -> bool:
-        """Whether the licence allows any use, as CC BY does, but not CC BY-NC or CC BY-ND."""
+        """Whether the licence allows any use. CC BY does, CC BY-NC and CC BY-ND do not."""
         return self.licence.startswith(FREE_LICENCES) and not RESTRICTED.search(self.licence)
 
     @property
@@ -160,7 +161,7 @@ def cut(picture: Image.Image, short_side_px: int, x: int, y: int) -> Image.Image
     """Scale a photograph to the shorter side `short_side_px`, and crop a square at (x, y)."""
     scale = short_side_px / min(picture.size)
     size = [max(short_side_px, round(side * scale)) for side in picture.size]
-    # The scaling is done for the crop only, because some photographs have 100 megapixels.
+    # Only the crop is scaled, because some photographs have 100 megapixels.
     box = np.array([x, y, x + CROP_SIDE_PX, y + CROP_SIDE_PX]) * (
         np.array(picture.size * 2) / np.array(size * 2)
     )

@@ -1,4 +1,4 @@
-"""Read folders of images whose cameras are known (three public layouts) or which have GPS.
+"""Read folders of images with known cameras, in three public layouts, or with GPS positions.
 
 - Strecha et al. (2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
 - KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt or K.txt, and with
@@ -91,8 +91,8 @@ class PosedScene:
         name: name of the folder.
         images: all images, sorted by name.
         pairs: the chosen pairs.
-        located_only: whether only camera positions are known, in metres, from GPS. Then cameras and
-            rotations are meaningless, and there are no pairs.
+        located_only: whether only camera positions are known, in metres, from GPS. If so, the
+            intrinsics and rotations are meaningless, and there are no pairs.
     """
 
     name: str
@@ -260,7 +260,7 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
 
 
 def _is_pinhole(camera: Any) -> bool:
-    """Whether a `pycolmap.Camera` has no lens distortion, tested at the border of its image."""
+    """Return whether a `pycolmap.Camera` has no lens distortion, tested at its image's border."""
     if not camera.focal_length_idxs():  # a panorama
         return False
     size = np.array([camera.width, camera.height])
@@ -292,7 +292,7 @@ def _posed_image(
 ) -> PosedImage:
     """Check the camera of an image, and return the image with its camera.
 
-    The camera matrix is given for an image of `size` (width, height). None: that of the file.
+    The camera matrix is for an image of `size` (width, height). If it is None, it is the file's.
     """
     wrong = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if wrong > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:

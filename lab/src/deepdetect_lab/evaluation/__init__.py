@@ -1,4 +1,4 @@
-"""Evaluate detectors: metrics, baselines to compare with, protocols (benchmarks) and reports."""
+"""Evaluate detectors by metrics, compare them with baselines, and write reports of benchmarks."""
 
 import lazy_loader
 

@@ -1,7 +1,8 @@
 """Run benchmarks by name and collect one report.
 
-To add a benchmark, write a function in a module of `protocols`, and add both names to `BENCHMARKS`.
-The function takes a `Run` and `BenchmarkOptions`, and returns the sections of the report.
+To add a benchmark, write a function in a module of `protocols`, and add the names of the module and
+the function to `BENCHMARKS`. The function takes a `Run` and `BenchmarkOptions`, and returns the
+sections of the report.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "foreground": ("paper", "foreground"),
     "low-visibility": ("planar", "low_visibility"),
 }
-"""Module in `protocols` and function of each benchmark. Modules are imported when needed."""
+"""Each benchmark's module in `protocols`, which is imported when needed, and its function."""
 
 
 def run_benchmarks(
@@ -44,8 +45,9 @@ def run_benchmarks(
 ) -> Report:
     """Run the named benchmarks of `BENCHMARKS` and return one report.
 
-    `data` has a subfolder for each data set, or is the folder of the only data set. A benchmark
-    without its data set is reported as failed, but if only one is named, an ImageError is raised.
+    `data` has a subfolder for each data set, or is the folder of the only data set. If a data set
+    is missing, its benchmark is reported as failed; if only one benchmark is named, an ImageError
+    is raised instead.
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]

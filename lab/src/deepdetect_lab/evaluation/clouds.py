@@ -23,7 +23,7 @@ POINT_AREA = 1.5
 a surface with one point per image pixel has no gaps when it is seen from the side."""
 
 ZOOM = 2.2
-"""Zoom of the plot: at 1, the box around a cloud would fill less than half the figure's width."""
+"""Zoom of the plot. At 1, the box around a cloud would fill less than half the figure's width."""
 
 
 def draw_cloud(

@@ -39,7 +39,8 @@ class MaskScore:
         images: number of images.
         calibration_error: expected calibration error (Naeini et al., 2015). Probabilities of all
             pixels are sorted into bins. For each bin, the mean probability is compared with the
-            fraction of pixels that masks mark. The error is the mean difference over pixels.
+            fraction of pixels that masks mark. The error is the mean absolute difference, in which
+            a bin's weight is its number of pixels.
         density: fraction of the pixels of the images with a probability over 0.5 (keypoints).
         label_density: fraction of the pixels of the images that the masks mark.
     """
@@ -123,7 +124,7 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def score_samples(
     heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, MaskScore]:
-    """Compare the heat maps that a function computes with masks; return scores by visibility."""
+    """Compare a function's heat maps with the images' masks; return the scores by visibility."""
     return _by_visibility(
         (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
     )
@@ -148,7 +149,7 @@ def check_scale(image: np.ndarray, scale: float, name: str = "an image") -> None
 def score_at_scale(
     detector: DeepDetect, images: Iterable[np.ndarray], scale: float
 ) -> dict[str, MaskScore]:
-    """Scale (H, W, 3) images; score the weights by fusion labels computed from the scaled images.
+    """Scale (H, W, 3) images; score the weights by labels that `fuse` makes of the scaled images.
 
     The network processes images at their scaled size. Returns a score for each visibility that
     occurs, "normal" or "low".
@@ -174,7 +175,7 @@ class Evaluation:
 
     Attributes:
         masks: agreement of heat maps with known masks, by visibility ("normal" or "low").
-        scales: agreement of scaled images' heat maps with their labels, by (scale, visibility).
+        scales: agreement of the heat maps of scaled images with labels, by (scale, visibility).
         failures: a sentence for each unusable sample, which the scores leave out.
     """
 
@@ -246,7 +247,7 @@ def evaluate(
 
 
 class LabelDetector:
-    """A detector without a network, whose keypoints are the pixels that the fusion label marks.
+    """A detector without a network, whose keypoints are the pixels that the label of `fuse` marks.
 
     It behaves like weights that predict the label perfectly. With heat-map options the label is
     computed from the resized image that a network would get, otherwise from the original image.
@@ -274,7 +275,7 @@ class LabelDetector:
 
 
 class LabelDensityDetector:
-    """A detector that takes the most probable pixels, as many as the image's fusion label marks.
+    """A detector that takes the most probable pixels, as many as the label of `fuse` marks.
 
     Weights that mark more pixels have a higher repeatability and more matches for this reason
     alone. With this detector, different weights are compared at equal numbers of keypoints.
@@ -282,7 +283,7 @@ class LabelDensityDetector:
 
     def __init__(self, detector: DeepDetect) -> None:
         self.detector = detector
-        seen = HeatmapOptions(detector.heatmap_options.resolution)  # labels need no `tta`
+        seen = HeatmapOptions(detector.heatmap_options.resolution)  # no test-time augmentation
         self.labels = LabelDetector(heatmap_options=seen)
 
     def heatmap(self, image: Any) -> np.ndarray:

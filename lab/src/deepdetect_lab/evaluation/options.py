@@ -28,7 +28,8 @@ from .masks import LabelDensityDetector
 
 PROTOCOLS = ("paper", "standard", "guided", "degraded")
 DEFAULT_PROTOCOLS = PROTOCOLS[:3]
-"""The protocol "degraded" is left out: it repeats "standard" for each of four degradations."""
+"""The protocol "degraded" takes four times as long as "standard", because it runs "standard" for
+each of four degradations. So it is not a default."""
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
@@ -54,8 +55,8 @@ class BenchmarkOptions:
         max_images: largest number of images per scene in structure from motion. If a scene has
             more, the first images of a sequence or evenly spaced other images are taken.
         equal_density: in the paper's protocol, take DeepDetect's N most probable pixels instead of
-            all over 0.5. N is the number of pixels that the image's fusion label marks. Otherwise
-            weights that mark more would score higher.
+            all with a probability over 0.5. N is the number of pixels that the image's label
+            marks. Without this option, weights that mark more pixels score higher.
         ranker: npz file written by `deepdetect dev train-points`, with the network that ranks
             multi-scale keypoints. None: the bundled file.
 
@@ -87,7 +88,7 @@ class BenchmarkOptions:
             )
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
-        """Return DeepDetect as in the paper: images of 480x480, SIFT descriptors of size 3 px."""
+        """Return DeepDetect as in the paper: for images of 480x480, with SIFT at a size of 3 px."""
         detector = self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels))
         title = f"DeepDetect, threshold {threshold:g}"
         name = f"deepdetect-{threshold:g}"
@@ -122,13 +123,13 @@ class BenchmarkOptions:
         return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
 
     def matching_features(self) -> list[LocalFeature]:
-        """Return the features of the paper's Table II: low-setting detectors, and DeepDetect."""
+        """Return the features of the paper's Table II: detectors with low settings, DeepDetect."""
         low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
         own = [self.deepdetect_480(), *self.chance_baselines()]
         return without_repeats([*low, *self.others, *own])
 
     def standard_features(self) -> list[LocalFeature]:
-        """Return the features of the standard protocol, chance baselines last."""
+        """Return the features of the standard protocol; the chance baselines come last."""
         ranked = {**STANDARD, **HESSIAN}
         chosen = [name for name in ranked if name in self.classical]
         # These features are measured twice: with the common descriptor, and with their own.

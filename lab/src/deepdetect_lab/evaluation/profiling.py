@@ -18,14 +18,14 @@ Outcome = TypeVar("Outcome")
 
 @dataclass
 class Profile:
-    """Seconds that a `profiled` block took, and bytes by which memory grew until its peak."""
+    """Seconds that a `profiled` block took, and bytes from the memory at its start to the peak."""
 
     seconds: float = 0.0
     memory: float = 0.0
 
 
 _highest = 0
-"""Peak memory of the process in bytes, until `profiled` last reset the system's counter of it."""
+"""Peak memory of the process in bytes, up to the time when `profiled` last reset its counter."""
 
 
 @contextmanager

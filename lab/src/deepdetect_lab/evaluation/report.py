@@ -103,12 +103,12 @@ Columns = Mapping[str, tuple[str, Measure]]
 
 
 def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
-    """Make a column: the mean of the value `name` over the rows that have the `wanted` values."""
+    """Make a column with the mean of the value `name` over rows that have the `wanted` values."""
     return style, lambda rows: mean(where(rows, **wanted), name)
 
 
 def median(style: str, name: Any) -> tuple[str, Measure]:
-    """Make a column: the median of the value `name` over the rows where it is not None."""
+    """Make a column with the median of the value `name` over the rows where it is not None."""
 
     def of_known(rows: Rows) -> Cell:
         known = [row[name] for row in rows if row[name] is not None]
@@ -223,7 +223,7 @@ WIDEST = 1600
 
 
 def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
-    """Draw a horizontal bar for each name, as PNG. `highlighted` bars have another colour."""
+    """Draw a horizontal bar for each name; return a PNG. `highlighted` bars have another colour."""
     figure = _figure(8, 0.32 * len(values) + 1)
     axes = figure.subplots()
     colors = ["C1" if name in highlighted else "C0" for name in values]
@@ -242,7 +242,7 @@ def line_chart(
     x_label: str,
     y_label: str,
 ) -> bytes:
-    """Draw a line through the (x, y) points of each name, with a legend, as PNG."""
+    """Draw a line through the (x, y) points of each name, with a legend; return a PNG."""
     figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
     axes.set_xlabel(x_label)

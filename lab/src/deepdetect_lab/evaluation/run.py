@@ -1,4 +1,4 @@
-"""A run of benchmarks: it finds data, caches results of stages, and records failures."""
+"""Run benchmarks: find data sets, cache results of stages, and record failures."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class MatchSettings:
     """How the descriptors of two images are matched.
 
     `matcher` matches descriptors with Euclidean distance; binary ones are always matched exactly by
-    Hamming distance. If `budget` is set, only this number of best keypoints per image is matched.
+    Hamming distance. If `budget` is set, only the `budget` best keypoints per image are matched.
     """
 
     matcher: str = "flann"
@@ -118,8 +118,9 @@ class Run:
     def attempt(self, name: str, work: Callable[..., Result], *arguments: Any) -> Result | None:
         """Return what `work` returns for these arguments; if it fails, record why and return None.
 
-        Errors of data, of external detectors and of OpenCV are recorded. Other errors are raised:
-        the cache is unusable, or there is a bug, since all options were checked before the run.
+        Errors of data, of external detectors and of OpenCV are recorded. Other errors are raised,
+        because they mean that the cache is unusable or that there is a bug. An OptionError is a
+        bug, because all options are checked before the run.
         """
         try:
             return work(*arguments)

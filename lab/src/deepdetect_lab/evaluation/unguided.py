@@ -1,4 +1,4 @@
-"""Match by descriptors alone, as in the paper. Benchmarks compare guided matching with this."""
+"""Match by descriptors alone, as in the paper, for comparison with guided matching."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PAPER_RATIO = 0.99
 """Threshold of the ratio test in the paper's published code."""
 
 UPRIGHT_SIFT = PointDescriptor(angle_deg=0.0)
-"""SIFT descriptor of the paper's size, but with the angle 0 instead of the paper's -1 degree."""
+"""SIFT descriptor with the paper's keypoint size of 3 px, but the angle 0 instead of -1 degree."""
 
 
 def match_unguided(
@@ -33,13 +33,14 @@ def match_unguided(
     mutual: bool = False,
     seed: int = 0,
 ) -> Matches:
-    """Match the keypoints of two images by their descriptors alone, without any geometry.
+    """Match the keypoints of two images by their descriptors, without estimating a geometry.
 
     Args:
         image0, image1: images in any form that `load_image` accepts.
         detector: object with a method `heatmap` or `detect`.
-        selection: which pixels of a heat map become keypoints. None: all with a value over 0.5.
-        descriptor: type, size and angle of the descriptors.
+        selection: which pixels of a heat map become keypoints. None: all with a probability over
+            0.5.
+        descriptor: type of the descriptors, and the size and angle that all keypoints get.
         matcher, ratio, mutual, seed: as in `match_features`.
     """
     start = time.perf_counter()

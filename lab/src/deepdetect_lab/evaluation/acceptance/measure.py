@@ -36,9 +36,10 @@ FAMILIES: dict[str, Callable[[Path], Iterator[JudgedPair]]] = {
 
 ORDERS, F_THRESHOLD_PX, F_CONFIDENCE, F_ITERATIONS, ACCURACY_PX = 11, 1.5, 0.9999, 10_000, 10
 """MAGSAC estimates F from the matches in `ORDERS` random orders, because its result depends on the
-order. Its threshold in pixels, confidence and iterations are those of published figures of the mAA
-(mean average accuracy): the fraction of hand-marked correspondences whose points are within d px of
-their epipolar lines in both images, averaged over d = 1, 2, ..., `ACCURACY_PX`."""
+order. Published values of the mAA (mean average accuracy) use the same threshold in pixels,
+confidence and number of iterations. The mAA is the fraction of hand-marked correspondences whose
+points are within d px of their epipolar lines in both images, averaged over d = 1, 2, ...,
+`ACCURACY_PX`."""
 
 COLUMNS = {
     **{"kind": "", "answers": ",d", "right": ",d", "wrong, high": ",d", "wrong, fair": ",d"},

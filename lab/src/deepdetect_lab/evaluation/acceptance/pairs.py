@@ -1,4 +1,4 @@
-"""Image pairs with their true geometry, which tells whether an answer is right."""
+"""Image pairs with their true geometry, which tells whether the matches of an engine are right."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ..protocols.pose import ERROR, GOOD_DEG, estimate_pose, pose_errors
 
 RIGHT_PX, MIN_CORRECT = 3.0, 0.5
 """A match is correct if its transfer error on a plane, or else its distance from its epipolar line,
-is below `RIGHT_PX`. An answer is right if at least the fraction `MIN_CORRECT` of its matches is
-correct, because otherwise the wrong matches would outvote the correct ones."""
+is below `RIGHT_PX`, which is chosen by hand. An answer (the matches of a pair) is right if at least
+the fraction `MIN_CORRECT` of its matches is correct; with fewer, wrong ones are the majority."""
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0.0]])
 """Fundamental matrix of a rectified pair, whose epipolar lines are the image rows."""
@@ -84,8 +84,8 @@ class Truth:
 
 
 UNRELATED = Truth()
-"""The truth of pairs that show nothing in common, or of which one image shows nothing: every answer
-with matches is wrong."""
+"""The truth of pairs whose images show nothing in common, or of which one image is blank. Every
+answer with matches is wrong."""
 
 
 @dataclass(frozen=True, eq=False)

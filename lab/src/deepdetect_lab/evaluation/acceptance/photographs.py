@@ -1,4 +1,4 @@
-"""Pairs of photographs with known geometry, in the layouts of the benchmarks."""
+"""Pairs of photographs with known geometry, read from the folders of the benchmarks' data sets."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from .pairs import ROWS, UNRELATED, Images, JudgedPair, Truth
 MIDDLEBURY_SIDES_PX, FAR_FRAMES, SAME_PLACE_PX = (None, 480), range(15, 26, 5), 5.0
 """Middlebury's pairs are matched at their own size and at a longer side of 480 px, at which
 thresholds in pixels act differently. Pairs of video frames `FAR_FRAMES` apart are a kind of their
-own. Images of one webcam or tripod fit the identity within a pixel, but errors below
-`SAME_PLACE_PX` count as correct: clouds and wind move things."""
+own. Images from one webcam or tripod are aligned to within a pixel, but errors below
+`SAME_PLACE_PX` count as correct, because clouds and wind move things. Chosen by hand."""
 
 
 def read(first: Path, second: Path, side_px: int | None = None) -> Images:
@@ -41,7 +41,7 @@ def oxford(data: Path) -> Iterator[JudgedPair]:
 
 
 def middlebury(data: Path) -> Iterator[JudgedPair]:
-    """Yield rectified pairs of scenes that are not planar, at `MIDDLEBURY_SIDES_PX`."""
+    """Yield rectified pairs of scenes that are not planar, at the sizes `MIDDLEBURY_SIDES_PX`."""
     for left in sorted(data.glob("middlebury/*/left.png")):
         for side in MIDDLEBURY_SIDES_PX:
             kind = f"middlebury, {side or 'native'}"
@@ -61,7 +61,7 @@ def posed(data: Path) -> Iterator[JudgedPair]:
 
 
 def wide(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs with wide baselines or other seasons and light, with points marked by hand."""
+    """Yield pairs with wide baselines, or in different seasons or light, and hand-marked points."""
     for marked in sorted(data.glob("wide/*/correspondences.txt")):
         first, second = (next(marked.parent.glob(f"{number}.*")) for number in (0, 1))
         places = np.loadtxt(marked).reshape(-1, 4)

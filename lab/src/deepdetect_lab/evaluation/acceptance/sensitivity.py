@@ -1,4 +1,4 @@
-"""How much the answers of guided matching depend on each of its numeric constants."""
+"""Measure how much the answers of guided matching depend on each of its numeric constants."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ MODULES = (
 """The modules of guided matching whose numeric constants are changed."""
 
 FACTORS = 0.7, 1.4
-"""Each constant is multiplied by either factor; all others keep their values. Chosen by hand."""
+"""Each constant is multiplied by each factor, while all other constants keep their values. Chosen
+by hand."""
 
 COLUMNS = {
     **{"constant": "", "module": "", "value": "", "factor": ".1f", "answers": ",d"},
@@ -75,7 +76,7 @@ def scaled(value: Value, factor: float) -> Value:
 
 @contextmanager
 def changed(name: str, module: ModuleType, value: Value) -> Iterator[None]:
-    """Give a constant another value in the context, also in modules that have imported it."""
+    """Give a constant another value within a `with` block, also in modules that import it."""
     before = vars(module)[name]
     users = [
         each
@@ -148,6 +149,6 @@ def _compared(before: Rows, after: Rows) -> Row:
 
 
 def table(rows: Rows) -> Table:
-    """Return a table of the rows, in which constants that change most answers come first."""
+    """Return a table of the rows, sorted by the fraction of changed answers, the largest first."""
     ordered = sorted(rows, key=lambda row: -row["changed"])
     return Table("sensitivity", "Constants of guided matching", COLUMNS, ordered, NOTE)

@@ -1,6 +1,7 @@
 """Pairs rendered from photographs: planes, facades, hard views, overlays, frames and strips.
 
-The seed of a pair's random generator is the number of its family and its own number.
+The seed of a pair's random generator consists of the number of the pair's family and its number
+within the family.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ levels. A phone's photographs taken indoors have about this noise."""
 
 SHARES, ASPECTS, MIN_ROTATION_DEG = (0.1, 0.2, 0.4), (6, 8, 12, 16), 5.0
 """Planes and overlays cover one of the fractions `SHARES` of the image. Strips are `ASPECTS` times
-as wide as high. Frames are laid on pairs whose cameras rotated by more than `MIN_ROTATION_DEG`. "No
-rotation", which fits the still frame, is then clearly wrong. Chosen by hand."""
+as wide as high. Frames are laid on pairs whose cameras rotated by more than `MIN_ROTATION_DEG`, so
+that a pose without rotation, which fits the still frame, is clearly wrong. Chosen by hand."""
 
 
 class Photographs:
@@ -45,7 +46,7 @@ class Photographs:
 
     @cached_property
     def posed(self) -> list[PosedPair]:
-        """Pairs with known cameras whose images are of one size."""
+        """Pairs with known cameras. Overlays and frames need images of one size."""
         return [pair for scene in load_posed_scenes(self.data) for pair in scene.pairs]
 
     def any(self, rng: np.random.Generator, size: tuple[int, int] = SIZE) -> np.ndarray:
@@ -69,14 +70,14 @@ def corners(width: float, height: float) -> np.ndarray:
 
 
 def moved_corners(rng: np.random.Generator, size: tuple[int, int], by: float) -> np.ndarray:
-    """Return a homography that moves the corners of an image by a fraction of its height."""
+    """Return a homography that moves each image corner at random by up to `by` times the height."""
     outline = corners(*size)
     moved = outline + rng.uniform(-by, by, (4, 2)) * size[1]
     return np.asarray(cv2.getPerspectiveTransform(outline, moved.astype(np.float32)))
 
 
 def noisy(image: np.ndarray, rng: np.random.Generator, gain: float = 1.0) -> np.ndarray:
-    """Return an image with the noise of a sensor, its values multiplied by a gain."""
+    """Multiply an image by a gain, and add the noise of a sensor."""
     values = image.astype(np.float32) * gain + rng.normal(0, NOISE, image.shape)
     return np.asarray(np.clip(values, 0, 255).astype(np.uint8))
 
@@ -123,10 +124,11 @@ def _plane(
 
 
 def facades(data: Path) -> Iterator[JudgedPair]:
-    """Yield two views of a facade of equal windows; the second starts one window farther right.
+    """Yield pairs of views of a facade with equal windows, the second one window farther right.
 
-    So nothing seems to have moved. The facade is alone, or surrounded by unrelated content, or has
-    a unique window and surroundings that both images show. Only the last kind can be answered.
+    Therefore nothing seems to have moved. The facade is alone, or surrounded by unrelated content,
+    or has a unique window and surroundings that both images show. Only pairs of the last kind can
+    be matched correctly.
     """
     photographs = Photographs(data)
     kinds = "facade alone", "facade between unrelated things", "facade with what occurs once"
@@ -222,7 +224,7 @@ def _hard_view(photographs: Photographs, number: int, kind: str) -> tuple[Images
 
 
 def overlays(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs of a moving camera with an overlay that stands still in the image."""
+    """Yield image pairs from a moving camera, with an overlay that stands still in the image."""
     photographs = Photographs(data)
     planar = [pair for scene in load_oxford(data / "oxford", "refined") for pair in scene.pairs]
     for number in range(OVERLAYS):
@@ -244,7 +246,7 @@ def overlays(data: Path) -> Iterator[JudgedPair]:
 
 
 def _overlay(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> np.ndarray:
-    """Return the mask of an overlay: a bonnet, strips of text, or a picture in the picture."""
+    """Return the mask of an overlay: a car's bonnet, strips of text, or a picture in a picture."""
     height, width = shape
     mask = np.zeros(shape, np.uint8)
     kind = rng.integers(3)
@@ -262,7 +264,7 @@ def _overlay(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> 
 
 
 def frames(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs of a rotating camera with a black frame: letter box, lens, border of a scan."""
+    """Yield image pairs from a rotating camera in black frames: letter boxes, lenses or scans."""
     pairs = [
         pair
         for pair in Photographs(data).posed
@@ -326,7 +328,7 @@ def strips(data: Path) -> Iterator[JudgedPair]:
 
 
 def noise(data: Path) -> Iterator[JudgedPair]:
-    """Yield pairs of a photograph and a picture of nothing: one grey level with noise."""
+    """Yield pairs of a photograph and a blank image, which has one grey level and noise."""
     photographs = Photographs(data)
     for number in range(len(SHARES) * 4):
         rng = np.random.default_rng([6, number])

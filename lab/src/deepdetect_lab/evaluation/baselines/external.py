@@ -97,7 +97,8 @@ def onnx_feature(
     """Make a local feature from an ONNX file. The backend is "onnxruntime" or "openvino".
 
     Raises:
-        WeightsError: the file cannot be opened, or lacks the inputs or outputs described above.
+        WeightsError: the file cannot be opened, or lacks an input or output that the text at the
+            top of this module describes.
     """
     file = Path(path)
     try:

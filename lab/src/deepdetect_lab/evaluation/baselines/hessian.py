@@ -18,7 +18,8 @@ SIGMA_PX = 3.0
 """Gaussian sigma in pixels of the baseline with a single scale. Chosen by hand."""
 
 SIGMAS_PX = tuple(float(sigma) for sigma in np.geomspace(1.5, 9.1, 7))
-"""Gaussian sigmas of the baseline with several scales, a factor of 1.35 apart. Chosen by hand."""
+"""Gaussian sigmas in pixels of the baseline with several scales. Successive sigmas differ by a
+factor of 1.35. Chosen by hand."""
 
 NMS_RADIUS = 2
 DISTANCE_PX = 2.0
@@ -62,7 +63,7 @@ HESSIAN: dict[str, LocalFeature] = {
         title,
         detect,
         PAPER_DESCRIPTOR.describe,
-        own_scale=OwnScaleDescriptor(0.5),  # describes at size 2.5 sigma; SIFT's size is 2 sigma
+        own_scale=OwnScaleDescriptor(0.5),  # a size of 2.5 sigma is near SIFT's 2 sigma
     )
     for name, title, detect in (
         ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),

@@ -1,4 +1,4 @@
-"""Local features, which benchmarks compare: pairs of a detector and a descriptor."""
+"""Local features that benchmarks compare. Each consists of a detector and a descriptor."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class LocalFeature:
     """A detector and its descriptor, with a name such as "sift-low" and a title for tables.
 
     Attributes:
-        detect: function from a (H, W, 3) uint8 RGB image to its keypoints.
+        detect: function from an (H, W, 3) uint8 RGB image to its keypoints.
         describe: function from the image and its N keypoints to (N, D) descriptors.
-        binary: descriptors are compared by Hamming distance instead of Euclidean distance.
-        learned: descriptors were learned together with their detector and need no ratio test.
+        binary: whether descriptors are compared by Hamming instead of Euclidean distance.
+        learned: whether descriptors were learned with their detector, and need no ratio test.
         version: text that changes whenever the results change. It is part of the key in the cache.
         detection: key of the cached keypoints, shared by features with the same detector. The
             default consists of name and version.
@@ -120,7 +120,7 @@ def with_common_descriptor(feature: LocalFeature) -> LocalFeature:
 def _described(
     feature: LocalFeature, descriptor: PointDescriptor | OwnScaleDescriptor, name: str, title: str
 ) -> LocalFeature:
-    """Return a copy with another descriptor. Repeated positions, as in SIFT, are described once."""
+    """Return a copy with another descriptor. Keypoints at equal positions (SIFT) become one."""
     return replace(
         feature,
         name=name,
@@ -142,7 +142,7 @@ def deepdetect_feature(
     descriptor: PointDescriptor = PAPER_DESCRIPTOR,
     version: str = "",
 ) -> LocalFeature:
-    """Make a local feature from a DeepDetect, or any detector with `heatmap` and a `version`."""
+    """Make a local feature from a DeepDetect, or from another detector if `version` is given."""
     if not version:
         digest = file_digest(detector.weights)[:16]
         version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"

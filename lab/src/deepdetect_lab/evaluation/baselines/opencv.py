@@ -1,6 +1,6 @@
 """OpenCV's classical detectors, with default settings and with the low thresholds of the paper.
 
-In the standard protocol, SIFT differs from OpenCV's default: it upscales precisely.
+In the standard protocol, SIFT has the option `enable_precise_upscale`, unlike OpenCV's default.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def self_described(name: str) -> LocalFeature:
 def _harris(
     name: str, title: str, block_size: int, aperture: int, k: float, quality: float
 ) -> LocalFeature:
-    """Make the paper's Harris detector (Harris and Stephens, 1988): several points per corner."""
+    """Make the paper's Harris detector (Harris and Stephens, 1988), with many pixels per corner."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
         response = cv2.dilate(cv2.cornerHarris(luma(rgb), block_size, aperture, k), None)

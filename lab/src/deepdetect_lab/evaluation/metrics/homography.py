@@ -33,7 +33,8 @@ def project_visible(
     """Map (N, 2) points into another image. Points that the other image does not show become NaN.
 
     Points behind the other camera also become NaN, even if the homography maps them into its image.
-    There the homography mirrors: the determinant of its Jacobian, det(H) / depth^3, is negative.
+    The homography mirrors the image around these points, so the determinant of its Jacobian,
+    det(H) / depth^3, is negative there.
     """
     depth = np.asarray(points, np.float64).reshape(-1, 2) @ homography[2, :2] + homography[2, 2]
     mapped = transform_points(points, homography)

@@ -1,4 +1,4 @@
-"""Errors of estimated cameras: of relative poses, or of absolute poses aligned with true ones."""
+"""Compute errors of relative poses, and of camera poses after alignment with the true ones."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
 def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
     """Return the angle between the directions of two translations, in degrees from 0 to 180.
 
-    SuperGlue and glue-factory accept the opposite direction. Here its error is 180 degrees, because
-    it would put the points behind the cameras. If the true translation is 0, the error is 0.
+    SuperGlue and glue-factory accept a translation in the opposite direction. Here such a
+    translation has an error of 180 degrees, because it would put the points behind the cameras. If
+    the true translation is 0, the error is 0.
     """
     across = float(np.linalg.norm(np.cross(estimated, true)))
     return float(np.degrees(np.arctan2(across, np.dot(estimated, true))))

@@ -79,7 +79,7 @@ def mutual_nn_repeatability(
 def _in_overlap(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, sizes: Sizes
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of each image that the other image shows, in pixels of the second."""
+    """Return the points of each image that the other shows, in coordinates of the second image."""
     mapped = project_visible(points0, homography, sizes[1])
     back = project_visible(points1, np.linalg.inv(homography), sizes[0])
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -91,7 +91,10 @@ def _kd_tree(points: np.ndarray) -> Any:
 
 
 def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest tree point of each point: distance (inf beyond the radius) and index."""
+    """Return the distance of each point to the nearest point in the tree, and that point's index.
+
+    If no point is within the radius, the distance is inf.
+    """
     # An upper bound saves time. KDTree excludes the bound, so the bound must exceed the radius.
     bound = np.nextafter(radius_px, np.inf)
     workers = -1 if min(tree.n, len(points)) > MIN_POINTS_FOR_THREADS else 1
@@ -118,9 +121,9 @@ def _chance(
 ) -> list[float]:
     """Return the repeatability of `counts` random points in the overlap, for each radius.
 
-    If `on_pixels`, the points are at pixel centres. These are repeated more often than other points
-    if nothing moves: a circle of 1 px around a pixel centre contains five centres, but has an area
-    of 3.14 pixels.
+    If `on_pixels`, the points are at pixel centres. If nothing moves between the images, these have
+    a higher chance level than other positions: a circle with a radius of 1 px around a pixel centre
+    has an area of 3.14 pixels, but contains five pixel centres.
     """
     fewest = min(counts)
     if not fewest:

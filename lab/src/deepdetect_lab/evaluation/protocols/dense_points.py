@@ -63,7 +63,8 @@ DENSE_NOTE = (
 
 
 CELL_PX = 4
-"""Clouds are compared in image squares of this side: some skip every second pixel."""
+"""Clouds are compared in square cells of the images with this side in pixels, because some clouds
+have points at every second pixel only. Chosen by hand."""
 
 CLOUD_COLUMNS = {
     "cloud": "",
@@ -187,7 +188,10 @@ def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> R
 def _sgbm_points(
     one: tuple[np.ndarray, PosedView], other: tuple[np.ndarray, PosedView], seen: np.ndarray
 ) -> np.ndarray:
-    """Match two images by SGBM, in the range of disparities of the sparse points `seen`, (M, 3)."""
+    """Return the (N, 3) points in the world that SGBM finds in two images.
+
+    The range of disparities is that of the sparse points `seen`, (M, 3).
+    """
     (rgb0, view0), (rgb1, view1) = one, other
     moved = view1.relative_to(view0)
     size, matrices = view0.camera.size, [view.camera.matrix for view in (view0, view1)]

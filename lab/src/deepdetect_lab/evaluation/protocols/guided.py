@@ -1,7 +1,7 @@
 """Compare guided matching with matching by descriptors alone and with chance.
 
-Guided matching finds many correct matches even for random points. So the counts of a detector only
-mean something in comparison with the counts of random points.
+Guided matching finds many correct matches even for random points. So the number of a detector's
+correct matches only means something in comparison with the number for random points.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..run import Run
 from .paper import CORRECT_PX, PAPER_MATCHING
 
 SEEDS = 3
-"""Number of seeds of guided matching: its random choices change the counts. Chosen by hand."""
+"""Guided matching runs with this number of seeds, because its counts vary. Chosen by hand."""
 
 COLUMNS = {
     "pair": "",
@@ -149,7 +149,7 @@ def _guided_cells(
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Name the models that guided matching, and the number of guided seeds if only some were."""
+    """Name the models that guided matching, and the number of guided seeds if some were not."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):

@@ -34,7 +34,7 @@ OXFORD_REPEATABILITY = _by_method("oxford_repeatability")
 HPATCHES_REPEATABILITY = _by_method("hpatches_repeatability")
 
 NOT_IN_DENSITY = "trees"
-"""The scene that the paper's mean densities leave out: only without it, our means equal them."""
+"""The scene that the paper's mean densities seem to leave out: ours only equal them without it."""
 
 
 def paper_title(title: str) -> str:

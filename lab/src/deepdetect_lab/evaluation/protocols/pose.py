@@ -47,8 +47,8 @@ MIN_MATCHES = 6
 """Any five matches fit some essential matrix exactly, so at least one more is needed."""
 
 NO_FAR_POINTS = 1e9
-"""OpenCV chooses one of an essential matrix's four poses by the points in front of both cameras
-and nearer than this number of baselines. The value is so large that all points count."""
+"""OpenCV chooses one of an essential matrix's four poses by the number of points that are in front
+of both cameras and nearer than this many baselines. The value is so large that all points count."""
 
 BUDGET = 8192
 RATIO = 0.8
@@ -167,7 +167,8 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
 def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
     """Measure a method on a pair, or read the result from the cache; return values by column title.
 
-    Errors are in degrees, and infinite without a pose. The guess without images has only errors.
+    Errors are in degrees, and infinite without a pose. If the method guesses without images, all
+    other values are None.
     """
     match = method.match
     images = (pair.first.path, pair.second.path)

@@ -43,7 +43,8 @@ from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
 MIN_IMAGES = 3
 
 POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
-"""Thresholds of the pose AUC: lower than for image pairs, as bundle adjustment is accurate."""
+"""Thresholds of the pose AUC. They are lower than those for image pairs, because poses are more
+accurate after bundle adjustment."""
 
 DATABASE = "sift.db"
 
@@ -308,9 +309,10 @@ def find_random_points(detector: PointDetector, stages: Stages, folder: Path) ->
 
 
 def find_sift(stages: Stages, folder: Path) -> None:
-    """Write keypoints of pycolmap's SIFT with its defaults: `MAX_KEYPOINTS` or some more.
+    """Write keypoints of pycolmap's SIFT, with its defaults except for `max_num_features`.
 
-    COLMAP drops the finest scales as long as at least `max_num_features` keypoints are left.
+    COLMAP drops the finest scales as long as at least `max_num_features` keypoints are left, so
+    there may be more than `MAX_KEYPOINTS`.
     """
     names = sorted(path.name for path in folder.iterdir())
     with quiet_pycolmap() as pycolmap:
@@ -334,7 +336,7 @@ def find_sift(stages: Stages, folder: Path) -> None:
 
 
 def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-    """Match SIFT by pycolmap's matcher with its defaults. A later stage verifies all matches."""
+    """Match SIFT keypoints by pycolmap's matcher with its defaults. A later stage verifies them."""
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureMatchingOptions()
         how.num_threads = 1
@@ -400,7 +402,8 @@ def _times() -> np.ndarray:
 def _unpacked(model: Any) -> Row:
     """Return the values of a pycolmap model, or empty and NaN values without a model.
 
-    "poses" has a row for each registered image: 9 numbers of the rotation, 3 of the translation.
+    "names" and "poses" have a row for each registered image. A row of "poses" has 9 numbers of the
+    rotation and 3 of the translation.
     """
     columns: Row = {**dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
     if model is None:

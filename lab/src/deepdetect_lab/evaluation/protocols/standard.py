@@ -1,4 +1,7 @@
-"""Compare features and chance on pairs with homographies, at equal numbers of keypoints."""
+"""Compare local features, and chance baselines, on image pairs with homographies.
+
+All methods are compared at equal numbers of keypoints.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +56,8 @@ MIN_FILLED = 0.9
 budget, because otherwise the numbers of keypoints would differ between methods. Chosen by hand."""
 
 MAX_CHANCE = 0.95
-"""Repeatability is not corrected for chance above this chance level: the divisor is 1 - chance."""
+"""Repeatability is not corrected for chance above this chance level, because the correction divides
+by 1 - chance. Chosen by hand."""
 
 MATCHING_NOTE = (
     f"The best {MATCHING_BUDGET:,} keypoints of each image are matched by mutual nearest "

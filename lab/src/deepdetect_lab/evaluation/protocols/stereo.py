@@ -25,9 +25,9 @@ from .paper_numbers import FIGURE_8, with_paper_column
 from .stereo_pipelines import ROUNDS, Pipeline, pipelines
 
 TRUTH_OFFSETS = {"dolls": 2}
-"""Scenes whose true disparity map belongs to a viewpoint this number of stereo baselines to the
-left of the left image. Shifting the map to the left image's viewpoint lowers the photometric error
-between the two images by over 30 %. Results are evaluated by both maps."""
+"""Scenes whose true disparity map belongs to a viewpoint to the left of the left image, with the
+distance in stereo baselines. After the map is shifted to the left image's viewpoint, the
+photometric error between the two images is over 30 % lower. Results are evaluated by both maps."""
 
 AS_IT_IS = ""
 SHIFTED = "ground truth shifted to its photographs"

@@ -22,8 +22,9 @@ def score_stereo_matches(
     """Match rectified pairs with the keypoints of several detectors, and evaluate the matches.
 
     `sources` maps names to detectors. Descriptors are matched over the whole image, without using
-    the rectification. Returns a row for each detector and pair. A detector is followed by random
-    points at its density, because more keypoints always find more matches. All pixels come last.
+    the rectification. Returns a row for each detector and pair. After the rows of a detector come
+    those of random points with its density, because more keypoints always give more matches. The
+    rows with all pixels as keypoints come last.
     """
     rows: list[dict[str, Any]] = []
     with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:

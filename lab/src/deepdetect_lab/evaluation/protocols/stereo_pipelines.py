@@ -1,4 +1,4 @@
-"""Pipelines from a stereo pair to points with disparities: ours, the paper's, SGBM, and chance."""
+"""Find points with disparities by DeepDetect, the paper's pipeline, SGBM and chance baselines."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from .paper_numbers import FIGURE_8
 
 ROUNDS = 3
-"""Pipelines that take seconds run this often; their median time is reported. Chosen by hand."""
+"""Default number of timed runs of a pipeline; the median time is reported. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray, int]
 """The result of a pipeline: pixels of points in the left image, (N, 2); their disparities, (N,);
@@ -40,7 +40,7 @@ class Pipeline:
 
     `prepare` does untimed work and returns the function to time, which is run `rounds` times.
     `name` and `version` identify cached results. `drawn` is the title in Figure 8, or "" if the
-    pipeline is not drawn. `paper` maps scenes to the numbers of points that the paper gives.
+    pipeline is not drawn there. `paper` maps scenes to the numbers of points that the paper prints.
     """
 
     name: str
@@ -59,7 +59,7 @@ PAPER_SETTINGS: dict[str, tuple[float, float, float, float]] = {
     "cloth": (0.9, 1050, 641, 555),
 }
 """Settings for each scene from the notebooks of the paper's authors: the threshold of the ratio
-test, then in pixels the focal length and the x and y of the principal point."""
+test, and in pixels the focal length, and x and y of the principal point."""
 
 PAPER_FLANN_TREES = 10
 PAPER_FLANN_CHECKS = 100
@@ -140,8 +140,8 @@ def paper_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match a stereo pair as the paper does; return the matched positions in both images, (M, 2).
 
-    The matches are the inliers of an essential matrix, which the paper calls voxels. Their number
-    varies by up to 1 % with the seed, because FLANN and RANSAC choose at random.
+    Only inliers of an essential matrix are returned, and the paper calls these inliers voxels.
+    Their number varies by up to 1 % with the seed, because FLANN and RANSAC choose at random.
     """
     images = scene.left, scene.right
     ratio, camera_matrix = paper_settings(scene)
@@ -199,8 +199,8 @@ def essential_inliers(
 def sgbm(scene: CalibratedStereoPair) -> Points:
     """Match every pixel by OpenCV's semi-global matching.
 
-    The range of disparities is the one that our pipeline finds, extended to start at 0 or below.
-    The views are extended by this range, so that pixels near the borders also get disparities.
+    The range of disparities is that of `find_disparity_range`, extended to start at 0 or below.
+    The views are padded by this range, so that pixels near the borders also get disparities.
     """
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
     search = find_disparity_range(*gray)
@@ -222,8 +222,8 @@ def sgbm_disparity(
 ) -> np.ndarray:
     """Match two rectified RGB views by OpenCV's semi-global matching.
 
-    The views are extended on the left and right by `borders_px`. The `num_disparities` to try,
-    from `min_disparity` on, must be a multiple of 16. Returns the disparities of the left view in
+    The views are padded on the left and right by `borders_px`. The matcher tries `num_disparities`
+    values, a multiple of 16, from `min_disparity` on. Returns the disparities of the left view in
     pixels, (H, W) float32, NaN where none was found.
     """
     matcher = cv2.StereoSGBM_create(
