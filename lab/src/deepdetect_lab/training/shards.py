@@ -136,7 +136,7 @@ def write_shards(
         output: folder for the shards, other than the folder of the images.
         options: the recipe, which determines the validation images, and all views and labels.
         shard_size: approximate number of images per shard.
-        workers: number of processes. None: one per processor.
+        workers: number of processes, by default one per processor.
         quiet: do not show a progress bar.
 
     Raises:
