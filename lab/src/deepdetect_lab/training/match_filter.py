@@ -201,7 +201,7 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
 
 
 def draw_samples(files: Sequence[Path], seed: int, count: int, quiet: bool = True) -> list[Sample]:
-    """Draw pairs of views in parallel. The files, the seed and the pair's number determine it."""
+    """Draw pairs of views in parallel. The files, the seed and its number determine a pair."""
     made = []
     with progress(count, "drawing pairs", "pair", quiet) as bar:
         for sample in map_in_processes(partial(draw_sample, files, seed), range(count)):

@@ -358,8 +358,8 @@ PRESETS: dict[str, TrainingOptions] = {
     "default": TrainingOptions(),
     # Small crops come first. The views have several sizes, and keep the images' aspect ratio.
     "espnet": _ESPNET,
-    # The paper's recipe (Section III-B): about 33,000 images to train on and 8,000 for validation,
-    # all squashed to 480x480; a quarter of them darkened; 100 epochs in batches of 64.
+    # As in the paper (Section III-B), about 33,000 images are for training, 8,000 for validation,
+    # all squashed to 480x480. A quarter of the crops are darkened. Batches have 64 crops.
     "paper": replace(
         _ESPNET,
         stages=(Stage(480, 64, 100),),

@@ -54,7 +54,7 @@ ZOOMS = (Effect(1, -0.2, 0.2), Effect(0.5, -math.log(2.1), math.log(2.1)))
 FAR_ZOOM = Effect(0.18, math.log(1.8), math.log(4.2))
 """Ranges of the logarithm of the zoom from the first to the second view. If several of these
 effects happen, the last one counts. `FAR_ZOOM` enlarges or reduces, with equal probability. It is
-used because a descriptor that was trained on less zoom was worse on zoomed images."""
+used because a descriptor trained on less zoom was worse on zoomed images. Chosen by hand."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
 """Index 0 is for the rotation of the first view, index 1 for the rotation between the views.
