@@ -1,4 +1,4 @@
-"""The nine label detectors: a function for each, and a table of all.
+"""The nine classical detectors that make labels: a function for each, and the table `DETECTORS`.
 
 To add a detector, write a function that takes an (H, W) uint8 grey image and settings and returns
 an (H, W) bool mask. Add it to `DETECTORS`. For each setting, give the value for normal images (the
@@ -41,7 +41,7 @@ class LabelDetector:
     """A classical detector.
 
     Attributes:
-        kind: whether the detector marks keypoints or edges (two masks in the paper's Figure 4).
+        kind: what the detector marks: keypoints or edges (two masks in the paper's Figure 4).
         function: function that takes an (H, W) uint8 grey image and all settings, and returns an
             (H, W) bool mask.
         settings: for each setting, its value for normal images and its allowed range. The range is
@@ -56,7 +56,7 @@ class LabelDetector:
 
     @property
     def defaults(self) -> dict[str, Value]:
-        """Settings for normal images."""
+        """The value of each setting for normal images, by name."""
         return {name: value for name, (value, _) in self.settings.items()}
 
     def mask(self, gray: np.ndarray, **settings: Value) -> np.ndarray:
@@ -65,9 +65,10 @@ class LabelDetector:
 
 
 def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:
-    """Return a bool mask that marks, for each of the points (N, 2), the nearest pixel.
+    """Return an (H, W) bool mask of the pixels nearest to points (N, 2), given as x and y.
 
-    `shape` is the image's shape. Points outside the image are ignored. Halves are rounded to even.
+    `shape` is the image's shape. Points outside the image are ignored. A coordinate midway between
+    two pixels is rounded to the even one.
     """
     mask = np.zeros(shape[:2], dtype=bool)
     column, row = np.rint(np.asarray(xy, dtype=np.float64).reshape(-1, 2)).astype(np.intp).T
@@ -112,7 +113,7 @@ def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
 def _brisk_detector(threshold: int, octaves: int) -> cv2.Feature2D:
     """Make a BRISK detector, or return the one made for earlier images.
 
-    In a dark image, computing BRISK's sampling pattern would take as long as detection.
+    Making one computes BRISK's sampling pattern. In a dark image, that takes as long as detection.
     """
     return opencv_factory("BRISK_create")(thresh=threshold, octaves=octaves)
 
@@ -144,8 +145,8 @@ def _agast(gray: np.ndarray, settings: Settings) -> np.ndarray:
 def _harris(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect corners by the gradient covariance matrix (Harris and Stephens, 1988).
 
-    The response is dilated by 3x3, so a corner becomes a blob. Then all pixels are marked whose
-    response exceeds a fraction of the largest one.
+    By default, the response is dilated by 3x3 pixels, so a corner becomes a blob. Pixels are marked
+    if their response exceeds a fraction of the largest response in the image.
     """
     response = cv2.cornerHarris(gray, settings["block_size"], settings["aperture"], settings["k"])
     if settings["dilate"]:
@@ -174,7 +175,7 @@ def _canny(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 
 def _sobel(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """Detect thick edges: mark wide Sobel gradients above a fraction of the largest gradient."""
+    """Detect thick edges: gradients (large Sobel kernel) above a fraction of the largest one."""
     dx = cv2.Sobel(gray, cv2.CV_64F, 1, 0, ksize=settings["kernel_size"])
     dy = cv2.Sobel(gray, cv2.CV_64F, 0, 1, ksize=settings["kernel_size"])
     magnitude = cv2.magnitude(dx, dy)

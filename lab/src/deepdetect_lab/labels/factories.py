@@ -1,4 +1,4 @@
-"""Factory functions of OpenCV, which its versions have in different places."""
+"""Factory functions that are in different modules in different versions of OpenCV."""
 
 from __future__ import annotations
 

@@ -32,12 +32,12 @@ LOW_VISIBILITY_RANGE = 64
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Label:
-    """A label that keypoint-edge fusion gives an image.
+    """The label of an image, made by keypoint-edge fusion.
 
     Attributes:
         keypoints: (H, W) bool, pixels marked by at least one keypoint detector.
         edges: (H, W) bool, pixels marked by at least one edge detector.
-        visibility: "normal" or "low", by which the settings of the detectors were chosen.
+        visibility: the settings that the detectors used, those for "normal" or "low" visibility.
     """
 
     keypoints: np.ndarray
@@ -144,13 +144,13 @@ class LabelTask:
 
     @property
     def outputs(self) -> Outputs:
-        """The output files, with a record of the image and options that they are made from."""
+        """The output files, with a record of the image and the options from which they are made."""
         paths = [self.mask] if self.figure is None else [self.mask, self.figure]
         return Outputs(paths, [self.image], {"label": self.options}, self.overwrite)
 
 
 def label_file(task: LabelTask) -> dict[str, Any] | str:
-    """Write the mask of an image file. Return values for its record, or the text of an error."""
+    """Write the mask of an image file; return values to report about it, or an error message."""
     try:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)

@@ -32,7 +32,7 @@ OPSET = 17
 """Version of the ONNX operator set. ONNX Runtime 1.24, OpenVINO and OpenCV 4 can all read it."""
 
 _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
-"""Shape to which batch normalisation's factors are brought to multiply a kernel, by node type."""
+"""Shape by node type in which factors, one for each output channel, multiply a kernel."""
 
 
 def to_onnx(
@@ -44,11 +44,12 @@ def to_onnx(
 ) -> onnx.ModelProto:
     """Convert a network to ONNX by tracing it with example `inputs`, which are given by name.
 
-    `axes` maps each input and the `output` to the names of its axes of variable size, by number.
+    For each input and for the `output`, `axes` maps the numbers of its axes of variable size to
+    names.
     """
     written = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # warnings of the tracer
+        warnings.simplefilter("ignore")  # of the tracer
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             network.cpu().eval(),
@@ -65,8 +66,8 @@ def to_onnx(
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
-    """Write a network that predicts heat maps, atomically, to an ONNX file for any image size."""
-    # The name "network" becomes part of all node names, on which `tiling` relies.
+    """Write a heat-map network, atomically, to an ONNX file that takes images of any size."""
+    # "network" becomes part of the names of all tensors; `tiling` cuts the file at some of these.
     module = nn.Sequential(OrderedDict(network=network))
     axes = {0: "batch", 2: "height", 3: "width"}
     # Batch normalisations stay separate nodes here, because `add_padding` folds them in float64.
@@ -121,7 +122,7 @@ def fold_normalisation(graph: GraphProto) -> None:
     values = {one.name: one for one in graph.initializer}
     made = {name: node for node in graph.node for name in node.output}
     for node in graph.node:
-        if node.op_type == "Identity" and node.input[0] in values:  # equal weights, stored once
+        if node.op_type == "Identity" and node.input[0] in values:  # an alias of equal weights
             values[node.output[0]] = values[node.input[0]]
     folded: list[NodeProto] = []
     for node in graph.node:
@@ -142,7 +143,7 @@ def fold_normalisation(graph: GraphProto) -> None:
             kernel = numpy_helper.to_array(values[name]) * factor.reshape(shape)
             arrays = {f"{name}.folded": kernel, f"{name}.bias": offset}
             before.input[:] = [before.input[0], *arrays]
-            for other in graph.node:  # `tiling` relies on the names of PyTorch's exporter
+            for other in graph.node:  # `tiling` cuts at tensors named by PyTorch
                 rename(other, target, source)
         else:
             both = {f"{target}.factor": factor, f"{target}.offset": offset}
@@ -157,8 +158,8 @@ def fold_normalisation(graph: GraphProto) -> None:
 def give_four_dimensions(graph: GraphProto) -> None:
     """Store constants with one value per channel as (1, C, 1, 1) instead of (C, 1, 1).
 
-    With three dimensions, OpenVINO transposes the features before and after each sum, product or
-    PReLU with such a constant. These transpositions took a third of the run time.
+    If such a constant of a sum, product or PReLU has three dimensions, OpenVINO transposes the
+    features before and after the operation. These transpositions took a third of its run time.
     """
     used = {
         name

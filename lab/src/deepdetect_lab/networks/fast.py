@@ -2,9 +2,10 @@
 
 Detectors with small windows compute the labels from the luma, so a few plain convolutions suffice.
 Runtimes compute these faster than the dilated branches and sums of ESPNet. But some thresholds of
-the detectors depend on the strongest response in the image, and the settings on its range of grey
-levels. So a global term is computed from the histogram of the luma and from means and maxima of the
-features. The term scales the input luma, and gives thresholds for the features before upsampling.
+the detectors depend on the strongest response in the image, and the choice of their settings on the
+image's range of grey levels. So a global term is computed from the histogram of the luma and from
+means and maxima of the features. It is a gain of the input luma, and thresholds that are subtracted
+from the features before upsampling.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from torch.nn.functional import (
 )
 
 HALF, QUARTER, EIGHTH = 16, 32, 40
-"""Numbers of channels at 1/2, 1/4 and 1/8 of the image size: fewest where layers are slowest."""
+"""Numbers of channels at 1/2, 1/4 and 1/8 of the image size: fewer in larger maps, to save time."""
 
 RED, GREEN, BLUE = 9798, 19235, 3735
 """Weights of red, green and blue in the luma (BT.601), in units of 1/32,768, as in OpenCV."""
@@ -30,10 +31,10 @@ BINS = 24
 Chosen by hand; not measured."""
 
 HISTOGRAM_STEP_PX = 8
-"""The histogram is made of every 8th pixel in both directions, to save time."""
+"""The histogram counts only every 8th pixel in both directions, to save time. Chosen by hand."""
 
 GAIN_RANGE = (-1, 5)
-"""Range of the natural logarithm of the gain that multiplies the luma. The gain may be this large
+"""Range of the natural logarithm of the gain that multiplies the luma. The largest gain is 148,
 because dark images may span only 1/100 of the grey levels."""
 
 
@@ -124,7 +125,7 @@ class FastNetwork(nn.Module):
         self.logits = nn.Conv2d(HALF, 4, 1)
         nn.init.constant_(
             self.get_parameter("logits.bias"), -1.0
-        )  # about the logit of the fraction of pixels that a label marks
+        )  # about the logit of the fraction of pixels that labels mark
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""

@@ -1,4 +1,4 @@
-"""Find networks by name, and read and write their weights as safetensors files with notes."""
+"""Find networks by name, and read and write their weights and notes as safetensors files."""
 
 from __future__ import annotations
 

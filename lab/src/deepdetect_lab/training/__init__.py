@@ -1,6 +1,7 @@
-"""Training: images -> views -> labels -> crops -> weights.
+"""Training of the detector, the keypoint ranker, the learned descriptor and the match filter.
 
-A `CropDataset` and a seeded `CropSampler` make a torch `DataLoader`. `train` does all these steps.
+To train the detector, `train` scales images to views, labels the views, and cuts random crops from
+them. A `CropDataset` and a seeded `CropSampler` make the batches of a torch `DataLoader`.
 """
 
 import lazy_loader

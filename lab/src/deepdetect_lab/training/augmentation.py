@@ -1,4 +1,4 @@
-"""Augmentation: darkening, transposition, colour changes with equal luma, and augmented views."""
+"""Augmentation: darkening, transposition, colour changes that keep luma, and augmented views."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
 darkened image spans fewer than 64 of the 256 grey levels: low visibility (`visibility_of`)."""
 
 EXPOSURE = (0.05, 0.24)
-"""Range of the brightness factor of a short exposure; its contrast is kept. At the factor 0.24, an
-image that spans all grey levels barely counts as one of low visibility."""
+"""Range of the brightness factor of a short exposure; its contrast factor is 1. At 0.24, an image
+that spans all grey levels just counts as one of low visibility. 0.05 is chosen by hand."""
 
 TURN_PROBABILITY = 0.5
 """Share of the augmented views that are rotated by an arbitrary angle. All other views are rotated
-by multiples of 90 degrees, because the interpolation for other angles blurs a view."""
+by multiples of 90 degrees, because interpolation blurs views at other angles. Chosen by hand."""
 
 CROP_SCALE = (0.7, 1.0)
 """Range of the cropped square's side, in units of the largest possible side. Chosen by hand."""
@@ -60,8 +60,9 @@ CAMERA = Camera(blur=Effect(0.3, 0.5, 2.5), noise=(Effect(0.25, 1, 8),), jpeg=Ef
 """Ranges of the changes of light and camera in augmented views. Chosen by hand; not measured."""
 
 READ_NOISE, SHOT_NOISE = (math.log(0.5), math.log(14.0)), (0.0, 1.0)
-"""Ranges of a sensor's noise: log of the read noise's standard deviation in grey levels, and the
-variance that shot noise adds per grey level. They are about log(8) and 0.5 on a phone at night."""
+"""`READ_NOISE` is the range of the natural logarithm of the read noise's standard deviation in grey
+levels, `SHOT_NOISE` the range of the variance that shot noise adds per grey level of the image. A
+phone's values at night are about log(8) and 0.5."""
 
 MAX_JITTER_SATURATION = 1.2
 """A hue rotation also scales the saturation by a random factor up to this one. Chosen by hand."""
@@ -100,7 +101,7 @@ def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -
     """Remove the colours or rotate the hue of (H, W, 3) uint8 RGB, and keep the luma.
 
     With `exact`, colours are always removed, because a hue rotation may change the luma by one grey
-    level. In a dark image, this would change the keypoints.
+    level, which would change the label of a dark image.
     """
     if exact or generator.random() < 0.5:
         return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
@@ -109,7 +110,7 @@ def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -
 
 
 def add_sensor_noise(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Add a random sensor's read and shot noise, half of the time grey, to (H, W, 3) uint8."""
+    """Add read and shot noise to (H, W, 3) uint8; in half of the cases, channels vary together."""
     read, gain = math.exp(generator.uniform(*READ_NOISE)), generator.uniform(*SHOT_NOISE)
     channels = int(generator.choice([1, 3]))
     noise = generator.standard_normal((*rgb.shape[:2], channels), np.float32)
@@ -131,7 +132,8 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
     cosine, sine = saturation * math.cos(angle), saturation * math.sin(angle)
     blue, red = blue_range * (cosine * blue - sine * red), red_range * (sine * blue + cosine * red)
     green = -(RED * red + BLUE * blue) / GREEN
-    # In each pixel: the largest difference from grey, divided by the largest that fits uint8.
+    # In each pixel, `above` and `below` are the largest difference from grey in a channel, divided
+    # by the largest difference that fits uint8.
     above = np.maximum(np.maximum(red, green), blue) / np.maximum(255 - gray, 1e-6)
     below = np.minimum(np.minimum(red, green), blue) / np.minimum(-gray, -1e-6)
     scale = 1 / np.maximum(np.maximum(above, below), 1)
@@ -140,7 +142,7 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
 
 
 def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
-    """Make a (side, side, 3) view of a random part of an image, with random augmentations.
+    """Make a (side, side, 3) uint8 view of a random part of an image, with random augmentations.
 
     The view may be rotated, relit, blurred, noisy or compressed. Its label is made from the view
     itself. Other versions of NumPy and OpenCV may give slightly different views for the same seed.

@@ -18,7 +18,7 @@ from deepdetect._shared.records import key
 from ..networks.weights import save_tensors
 
 Point = dict[str, float]
-"""A point of the training curves: losses and measures, by name, after a number of steps."""
+"""A point of the training curves: the number of steps, the losses and the measures, by name."""
 
 
 def save_checkpoint(
@@ -65,8 +65,8 @@ def restore(
 ) -> None:
     """Restore a network, its moving average and its optimisers from a checkpoint of the same run.
 
-    The caller makes sure that the run is the same. Shapes of moments are not checked here, and a
-    fused optimiser would write past the end of a moment that is too small.
+    The caller must make sure that the run is the same: the shapes of the optimisers' moments are
+    not checked, and a fused optimiser would write past the end of a moment that is too small.
     """
     for kind, module in (("network", network), ("average", average)):
         module.load_state_dict({name: tensors[f"{kind}.{name}"] for name in module.state_dict()})

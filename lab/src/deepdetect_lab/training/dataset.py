@@ -96,7 +96,7 @@ class FolderSource:
         """Make the missing labels of each image's `views`, in parallel; return their number.
 
         Raises:
-            BatchError: images cannot be read. The labels of all other images are made.
+            BatchError: some images cannot be read. The labels of all other images are made.
         """
         tasks, memory = [], self.memory_bytes
         for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
@@ -183,7 +183,7 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
     def _choose_view(
         self, image: SourceImage, stage: Stage, generator: np.random.Generator
     ) -> View:
-        """Choose normal or dark light at random, then a view with a size that the stage crops."""
+        """Choose normal or dark light at random, then a view whose size suits the stage."""
         dark = generator.random() < self.options.dark_fraction
         fitting = [
             view
@@ -234,7 +234,7 @@ def prepare_data(
     """List the images of a run, and make the missing labels of their views.
 
     The arguments are those of `train`, and `processes`: the number of processes that load crops.
-    Each may keep training views in its part of half of the free memory.
+    Half of the free memory is divided among these processes, which keep training views in it.
     """
     images, output = Path(images), Path(output)
     folder = output / "labels" if labels is None else Path(labels)

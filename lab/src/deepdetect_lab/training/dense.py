@@ -189,7 +189,7 @@ class DenseTrainer(Trainer):
         return binary_cross_entropy_with_logits(logits, truth, pos_weight=self._pos_weight(images))
 
     def _pos_weight(self, images: Tensor) -> Tensor | None:
-        """Return the loss weight of marked pixels: (B, 1, 1, 1), (1,) if equal, None if it is 1."""
+        """Return the loss weight of marked pixels: (B, 1, 1, 1), or (1,) if equal, or None if 1."""
         normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
         if dark is None or dark == normal:  # the weight does not depend on the visibility
             return None if normal == 1 else self.to_device(torch.tensor([normal]))
@@ -233,7 +233,7 @@ class DenseTrainer(Trainer):
 
 
 def freeze_batch_norm(network: nn.Module) -> None:
-    """Make batch normalisations use running statistics, until `network.train()` is called."""
+    """Normalise batches by the running statistics, until `network.train()` is called."""
     for module in network.modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             module.eval()

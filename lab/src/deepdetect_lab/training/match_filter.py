@@ -61,12 +61,12 @@ LEAST_TRUST = 0.5
 number. So the result is near 0 if all weights are near 0. Chosen by hand."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
-"""Side of the square views in pixels, their largest number of keypoints, and the least number of
-matches of a pair: one more than a match has neighbours (`AROUND`)."""
+"""Side of the square views in pixels, their largest number of keypoints (both chosen by hand), and
+the least number of matches of a pair: one more than a match has neighbours in an image."""
 
 UNRELATED = 7
 """Every 7th pair shows two unrelated scenes. Pairs alternate between the two descriptors. The
-number is odd, so that unrelated pairs occur with each descriptor."""
+number is odd, so that unrelated pairs occur with each descriptor. Chosen by hand."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
 """A match with an error below `RIGHT_PX` is correct. A match with an error above `WRONG_PX` is
@@ -145,8 +145,10 @@ class MatchFilter(nn.Module):
     ) -> Tensor:
         """Return (M, 2 K, 11) features of each match relative to its K neighbours in each image.
 
-        The first eight are offsets to the neighbour, in units of the typical distance of
-        neighbours, with large values compressed. The last three are logarithms of scale changes.
+        The first eight are x and y of four vectors: the offset to the neighbour in each image, the
+        difference of both offsets, and the second offset minus the one that the match predicts.
+        They are in units of the typical distance of neighbours, and large values are compressed.
+        The last three features are logarithms of scale changes.
         """
         there0, there1 = xy0[around] - xy0[:, None], xy1[around] - xy1[:, None]
         away0, away1 = (each.square().sum(2).sqrt() for each in (there0, there1))
@@ -199,7 +201,7 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
 
 
 def draw_samples(files: Sequence[Path], seed: int, count: int, quiet: bool = True) -> list[Sample]:
-    """Draw pairs of views in parallel. Each pair depends only on the files, seed and its number."""
+    """Draw pairs of views in parallel. The files, the seed and its number determine a pair."""
     made = []
     with progress(count, "drawing pairs", "pair", quiet) as bar:
         for sample in map_in_processes(partial(draw_sample, files, seed), range(count)):
@@ -340,7 +342,8 @@ MEASURES = ("right", "precision", "of unrelated views")
 def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]:
     """Return the loss on validation pairs, and measures of the ratio test and of the filter.
 
-    The filter is measured at the logit threshold 0, and where it is as precise as the ratio test.
+    The filter is measured at the logit threshold 0, and at the one that gives it the precision of
+    the ratio test.
     """
     found, losses = {}, []
     for offset, name in enumerate((LEARNED, ROOT_SIFT)):

@@ -14,6 +14,8 @@ BETA = 0.95
 """Decay per step of the running means of `Soap`, as in its paper, and of the momentum of `Muon`."""
 
 EPS = 1e-8
+"""Number added to denominators in `Soap`, as by default in torch's Adam."""
+
 PRECONDITION_FREQUENCY = 10
 """Number of steps between updates of the eigenbasis of `Soap`, as in its paper."""
 
@@ -22,11 +24,15 @@ NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)
 polynomial moves them close to 1 (Keller Jordan, "Muon")."""
 
 NEWTON_SCHULZ_STEPS = 5
+"""Number of applications of the polynomial, as in Keller Jordan's Muon."""
+
 MUON_RMS = 0.2
-"""Root mean square of the elements of a Muon step, in units of the learning rate. Adam steps are
+"""Root mean square of the elements of a Muon step, in units of the learning rate. Steps of Adam are
 about as large (arXiv:2502.16982)."""
 
 MUON_WEIGHT_DECAY = 0.01
+"""Weight decay per step, divided by the learning rate, as by default in torch's AdamW."""
+
 INITIAL_POWER_ITERATIONS = 3
 """Number of power iterations from the identity to `Soap`'s first eigenbasis. Chosen by hand."""
 
@@ -70,7 +76,7 @@ class Soap(KernelOptimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 
     The first step only computes the first eigenbasis. The SOAP of the package pytorch-optimizer is
-    not used, because its state also holds lists and numbers.
+    not used, because its state also holds lists and numbers, which safetensors cannot store.
     """
 
     def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:

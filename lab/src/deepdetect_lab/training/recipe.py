@@ -78,7 +78,7 @@ class TrainingOptions:
             cheaper.
         interleave: mix the steps of all stages evenly, so that all crop sizes are used to the end.
         short_sides: sizes in pixels to which the shorter side of each image is scaled, one view for
-            each size. The first size is used for validation.
+            each size. Validation uses the first size.
         square: make images square: "crop" takes the central square, "squash" resizes without
             keeping the aspect ratio, as in the paper. None: keep the aspect ratio.
         max_images: use at most this many images, including those for validation.
@@ -103,7 +103,7 @@ class TrainingOptions:
             those of small batches are unreliable. None: only if the initial weights are trained.
         pos_weight: weight in the loss of pixels that are marked in the label. With 1, an uncertain
             network marks too few pixels, because most are not marked. Above 1, it marks more.
-        low_light_pos_weight: `pos_weight` in crops of low visibility. None: as in all other crops.
+        low_light_pos_weight: `pos_weight` in crops of low visibility. None: equal to `pos_weight`.
         labels: the label detectors and their settings.
         val_count: number of validations.
         seed: seed of the initial weights, the image order, the crops and their augmentation.
@@ -192,7 +192,7 @@ class DeviceOptions:
         compile: use torch.compile; by default on a GPU, or if there is a C++ compiler.
         threads: number of CPU threads of torch; by default torch's choice.
         num_workers: number of processes that load and augment crops; with 0, the training process
-            does it itself. Default: 0 on a CPU; on a GPU one less than the number of processors.
+            does it. None: 0 on a CPU; on a GPU, one less than the number of processors.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -309,7 +309,7 @@ class MatchFilterTrainingOptions:
     Attributes:
         steps: optimiser steps.
         pairs: pairs of views in each step, each varied at random.
-        drawn: number of pairs drawn before the first step. Each step takes its pairs from these.
+        drawn: number of pairs drawn before the first step. All steps take their pairs from them.
         learning_rate: highest learning rate, after the warm-up; it falls linearly to 0.
         val_count: number of validations.
         val_pairs: number of validation pairs.
@@ -358,8 +358,8 @@ PRESETS: dict[str, TrainingOptions] = {
     "default": TrainingOptions(),
     # Small crops come first. The views have several sizes, and keep the images' aspect ratio.
     "espnet": _ESPNET,
-    # The paper's recipe (Section III-B): about 33,000 images to train on and 8,000 for validation,
-    # all squashed to 480x480. A quarter of the crops are darkened. 100 epochs in batches of 64.
+    # As in the paper (Section III-B), about 33,000 images are for training, 8,000 for validation,
+    # all squashed to 480x480. A quarter of the crops are darkened. Batches have 64 crops.
     "paper": replace(
         _ESPNET,
         stages=(Stage(480, 64, 100),),
@@ -371,8 +371,8 @@ PRESETS: dict[str, TrainingOptions] = {
         color_jitter=0.0,
         val_count=20,
     ),
-    # For two-view geometry, like the paper's second weights (Figure 8): labels mark more pixels,
-    # and all views are in normal light. The recipe is meant to start from trained weights.
+    # This recipe is for two-view geometry, like the paper's second weights (Figure 8): labels mark
+    # more pixels, and all views are in normal light. It is meant to start from trained weights.
     "dense": TrainingOptions(
         dark_fraction=0.0, labels=LABEL_SETTINGS["dense"], learning_rate=1.5e-3
     ),

@@ -53,13 +53,13 @@ def train(
         validation: folder of other images for validation. None: some of `images` are held out.
         labels: folder in which labels are cached. None: a folder in `output`.
         init_weights: .safetensors files or bundled weights ("default", "dense", "free", "espnet")
-            to start from; several are averaged. None: random weights by the seed.
+            to start from; several are averaged. None: random weights from the seed.
         device: device, precision, compilation and processes.
         workers: number of processes that make labels. None: one per processor.
         log: function that gets each line of text for the user. None: no text, and no progress bars.
 
     Returns:
-        The weights' files and the loss curves.
+        The files of the weights, and the loss curves.
 
     Raises:
         ImageError: a folder is missing or empty.
@@ -117,7 +117,7 @@ def train_on_pairs(
             safetensors and an ONNX file otherwise), MODEL_CARD.md and the training curves.
         options: the recipe.
         init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file,
-            or with `crops` also EdgePoint2's L64.pth. None: random weights by the seed.
+            or with `crops` also EdgePoint2's L64.pth. None: random, from the seed.
         readings: folder written by `deepdetect dev read-teachers`, for a descriptor with `crops`.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
         num_workers: number of processes that generate pairs; with 0, the training process does it.
@@ -131,8 +131,8 @@ def train_on_pairs(
 
     Raises:
         ImageError: a folder is missing or empty.
-        OptionError: `output` holds a run with other options or images, or the images have too
-            little detail.
+        OptionError: `output` holds a run with other options or images, the images have too little
+            detail, or `options.crops` is not 0 but `readings` is None.
         WeightsError: the initial weights are missing or do not fit.
 
     Example:

@@ -1,4 +1,4 @@
-"""The steps of a run and their batches, which are the same after an interruption."""
+"""The steps of a run and their batches, which do not change if the run is interrupted."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class CropIndex(NamedTuple):
 
 
 class Position(NamedTuple):
-    """A step's stage, the number of its first crop in the stage, and the stage's first epoch."""
+    """A step's stage, the index in it of the step's first crop, and the stage's first epoch."""
 
     stage: Stage
     sample: int
@@ -57,7 +57,7 @@ class Schedule:
         self._crops = np.concatenate([[0], np.cumsum(batches[self._stages])])
 
     def position(self, step: int) -> Position:
-        """Find the stage of a step and the position of the step in its stage."""
+        """Find the stage of a step, and where in the stage the step begins."""
         number = int(self._stages[step])
         stage = self.options.stages[number]
         first_epoch = sum(each.epochs for each in self.options.stages[:number])
@@ -85,9 +85,9 @@ class CropSampler(Sampler[list[CropIndex]]):
 
     Args:
         schedule: the steps.
-        shard_sizes: number of images in each shard, so that the crops of only a few shards are
-            mixed at a time. None: the images are not in shards, and are all mixed.
-        first_step: number of the step to begin with. All later steps follow.
+        shard_sizes: number of images in each shard; images of only a few shards are mixed at a
+            time. None: the images are not in shards, and are all mixed.
+        first_step: number of the first step to make batches for. All later steps follow.
 
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
@@ -124,7 +124,7 @@ class CropSampler(Sampler[list[CropIndex]]):
         return batch
 
 
-@functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs at a time
+@functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs
 def epoch_order(
     seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
 ) -> np.ndarray:

@@ -33,10 +33,10 @@ from .synthetic import (
 Drawn = TypeVar("Drawn")
 
 SIDE_PX = 256
-"""Default side of the square views, for which `PERSPECTIVE` is given. Chosen by hand."""
+"""Default side of the square views. `PERSPECTIVE` is for views of this side. Chosen by hand."""
 
 MARGIN_PX = 6
-"""Keypoints closer than this to a view's border are not used: their surroundings are cut off."""
+"""Keypoints closer than this to a view's border are not used: too little is seen around them."""
 
 OFFSET_PX = 90.0
 """The centre of the first view is up to 90 pixels from the photograph's centre along each axis. So
@@ -54,7 +54,7 @@ ZOOMS = (Effect(1, -0.2, 0.2), Effect(0.5, -math.log(2.1), math.log(2.1)))
 FAR_ZOOM = Effect(0.18, math.log(1.8), math.log(4.2))
 """Ranges of the logarithm of the zoom from the first to the second view. If several of these
 effects happen, the last one counts. `FAR_ZOOM` enlarges or reduces, with equal probability. It is
-used because a descriptor that was trained on less zoom was worse on zoomed images."""
+used because a descriptor trained on less zoom was worse on zoomed images. Chosen by hand."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
 """Index 0 is for the rotation of the first view, index 1 for the rotation between the views.
@@ -63,9 +63,10 @@ standard deviations `UPRIGHT_DEVIATIONS` in radians (about 8 degrees). Chosen by
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
 """The tilt of a view is the ratio of its scales along two axes. In the share `NORMAL_TILT` of the
-second views, its logarithm is normally distributed with the standard deviation `TILT_DEVIATION`. In
-all other second views, the logarithm is uniform up to the tilt `LARGEST_TILT`, at which a plane is
-seen at 66 degrees. Beyond it, little of the plane can be described."""
+second views, the logarithm of the tilt is the absolute value of a normal variable with the standard
+deviation `TILT_DEVIATION`. In all other second views, it is uniform up to the tilt `LARGEST_TILT`,
+at which a plane is seen at 66 degrees. At larger tilts, little of the plane can be described. The
+other two values are chosen by hand."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
 """The tilt of the scene in first views is at most 1 + `FIRST_TILT`, and the tilt of foreground
@@ -73,8 +74,8 @@ parts at most 1 + `FRONT_TILT`. A tilt of 1 means no tilt. Chosen by hand."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
 """Standard deviation of both perspective coefficients of a homography, per pixel of a view with
-`SIDE_PX` pixels a side. Such a coefficient changes the scale by 11 % from the middle to a border.
-In first views, the coefficients are multiplied by `FIRST_PERSPECTIVE`. Chosen by hand."""
+`SIDE_PX` pixels a side. A coefficient of this size changes the scale by 11 % from the middle to a
+border. In first views, coefficients are multiplied by `FIRST_PERSPECTIVE`. Chosen by hand."""
 
 SHIFT_DEVIATION = 18.0
 """Standard deviation of the second view's shift, in pixels of the first view. Chosen by hand."""
@@ -94,20 +95,22 @@ share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs. Chosen by
 
 SHAPE_PX, UNCOVERED = 480, (0.6, 0.88)
 """A foreground part is cut from a photograph where smooth noise (`SHAPE_PX` pixels a side) exceeds
-a quantile from `UNCOVERED`: a blob of 12 to 40 % of the photograph. Chosen by hand."""
+its quantile at a level drawn from `UNCOVERED`, which leaves 12 to 40 % of the photograph. Chosen by
+hand."""
 
 FRONT_OFFSET_PX, FRONT_SCALE, FRONT_ANGLE = 60.0, 0.2, 0.3
-"""Pose of a foreground part relative to the scene's pose in the first view: largest offset per axis
-in photograph pixels, standard deviations of log scale and angle in radians. Chosen by hand."""
+"""Random pose of a foreground part relative to the scene in the first view: the largest offset per
+axis in photograph pixels, and the standard deviations of the log scale and of the angle in radians.
+Chosen by hand."""
 
 MOTION_SHIFT, MOTION_SCALE, MOTION_ANGLE, MOTION_TILT = 22.0, 0.12, 0.06, 0.15
-"""Standard deviations of a foreground part's motion relative to the scene, between the views: shift
-in pixels of the first view, log scale, angle in radians, log tilt. Chosen by hand."""
+"""Standard deviations of a foreground part's own motion between the views, relative to the scene's
+motion: shift in pixels of the first view, log scale, angle in radians, log tilt. Chosen by hand."""
 
 ALIASED_SCALE, PIXEL_SIGMA = 1.15, 0.5
 """A photograph that is reduced by a factor above `ALIASED_SCALE` is blurred before it is sampled,
 against aliasing. A pixel is treated as a Gaussian with a sigma of `PIXEL_SIGMA` pixels. The blur
-widens the Gaussian of a pixel of the photograph to that of a pixel of the view."""
+widens the Gaussian of a photograph's pixel to that of a view's pixel. Chosen by hand."""
 
 COVERED = 0.5
 """A foreground part counts as visible in a pixel if it covers more than this share of the pixel."""
@@ -262,7 +265,7 @@ def _draw_relief(rng: np.random.Generator, side_px: int) -> np.ndarray:
 def _draw_front(
     rng: np.random.Generator, files: Sequence[Path], scene: Layer, poses: tuple[Pose, Pose]
 ) -> Layer:
-    """Draw a foreground part of a scene, which moves with the scene and a little on its own."""
+    """Draw a foreground part of a scene, which moves with the scene and has a small own motion."""
     first, second = poses
     side_px = scene.views[0].side_px
     other = happens(rng, OTHER_PHOTOGRAPH_SHARE)
@@ -289,7 +292,8 @@ def _draw_front(
 def render_layers(layers: Sequence[Layer], side: int, scale: float) -> tuple[np.ndarray, ...]:
     """Render one of the two views; return (S, S) float32 and the number of each pixel's top layer.
 
-    `side` is 0 for the first view, 1 for the second. The view shows the luma.
+    `side` is 0 for the first view, 1 for the second. `scale` is in pixels of the photograph per
+    pixel of the view. The view shows the luma, in grey levels.
     """
     size = (layers[0].views[side].side_px,) * 2
     view, top = np.zeros(size, np.float32), np.zeros(size, np.uint8)

@@ -50,7 +50,7 @@ Files = tuple[tuple[Path, int], ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """A folder of shards: each shard's path and number of images. Names hold a content digest."""
+    """A folder of shards, with the path (its name holds a digest) and number of images of each."""
 
     folder: Path
     training: Files
@@ -136,13 +136,13 @@ def write_shards(
         output: folder for the shards, other than the folder of the images.
         options: the recipe, which determines the validation images, and all views and labels.
         shard_size: approximate number of images per shard.
-        workers: number of processes; default one per processor.
-        quiet: show no progress bar.
+        workers: number of processes, by default one per processor.
+        quiet: do not show a progress bar.
 
     Raises:
         ImageError: the folder of images is missing, or has too few images.
         OptionError: `output` has shards that were made with other options.
-        BatchError: images cannot be read. Shards without these images are kept.
+        BatchError: some images cannot be read. Shards without these images are kept.
         DeepDetectError: a shard cannot be written.
 
     Example:

@@ -1,6 +1,6 @@
 """Operations for synthetic views: homographies, and changes of light, blur, noise and JPEG.
 
-A `Light` and a `Camera`, made of `Effect`s, set how often and how strongly each is applied.
+A `Light` and a `Camera` consist of `Effect`s, which set how often and how strongly views change.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ CURVE_TONES = 6
 DARK_NOISE_LEVELS, DARK_NOISE_LIGHT = (0.2, 0.6, 3.0), 0.25
 """The sigma of the noise in dark views is drawn between 0.2 grey levels and a maximum. The maximum
 grows from 0.6 without light to 3.0 at the fraction `DARK_NOISE_LIGHT` of the light, because shot
-noise grows with the number of photons."""
+noise grows with the number of photons. Chosen by hand."""
 
 
 def happens(rng: np.random.Generator, share: float) -> bool:
-    """Draw whether an effect happens, with probability `share`; 0 and 1 use no random number."""
+    """Draw whether an effect with probability `share` happens; 0 and 1 draw no random number."""
     return share >= 1 or (share > 0 and rng.random() < share)
 
 
 class Effect(NamedTuple):
     """An effect on views: the share of the views that get it, and the range of its strength.
 
-    The strength is drawn uniformly if `power` is 1. A power above 1 makes strengths near `low` more
-    frequent, a power below 1 strengths near `high`.
+    If `power` is 1, the strength is drawn uniformly. With a power above 1, strengths near `low` are
+    more frequent; with a power below 1, strengths near `high`.
     """
 
     share: float
@@ -172,7 +172,7 @@ def blur(rng: np.random.Generator, view: np.ndarray, camera: Camera) -> np.ndarr
 
 
 def record(rng: np.random.Generator, levels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Darken a float view in grey levels, add noise, compress it; return uint8."""
+    """Darken a float view in grey levels, add noise and compress it, at random; return uint8."""
     if camera.log_dark.happens(rng):
         light = math.exp(camera.log_dark.strength(rng))
         least, *most = DARK_NOISE_LEVELS
@@ -226,7 +226,7 @@ def rotation(angle: float) -> np.ndarray:
 def scaled_along(azimuth: float, along: float, across: float) -> np.ndarray:
     """Return the (2, 2) matrix that scales by `along` in a direction, by `across` at right angles.
 
-    `azimuth` is the angle of the direction in radians.
+    `azimuth` is the angle from the x axis to the direction, in radians.
     """
     return rotation(azimuth) @ np.diag([along, across]) @ rotation(-azimuth)
 
@@ -242,5 +242,5 @@ def smooth_noise(rng: np.random.Generator, side_px: int, cells: tuple[int, int])
 
 @lru_cache
 def pixels(side_px: int) -> np.ndarray:
-    """Return the (S, S, 2) float32 positions of a view's pixels."""
+    """Return the positions, (S, S, 2) float32 x and y, of the pixels of a view."""
     return np.stack(np.meshgrid(*[np.arange(side_px, dtype=np.float32)] * 2), -1)

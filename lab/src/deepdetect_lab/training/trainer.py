@@ -36,7 +36,7 @@ CARD = "MODEL_CARD.md"
 FULL_IMAGE_PIXELS = 480 * 480
 
 CHECKPOINT_INTERVAL_S = 60.0
-"""Seconds between checkpoints, so that a killed run loses at most this time."""
+"""Seconds between checkpoints: a killed run loses about this time at most. Chosen by hand."""
 
 
 @dataclass
@@ -87,7 +87,7 @@ class Trainer(abc.ABC):
         measures: what the validation measures, as a text for the model card.
         introduction: lines that are shown to the user before the first step.
         steps: number of steps of the whole run.
-        milestones: numbers of steps after which the network is validated.
+        milestones: numbers of steps after which the averaged network is validated.
         objective: name of the measure by which the best weights are chosen.
         sign: 1 if the lowest value of the measure is the best, -1 if the highest is.
         weights_file: name of the file of the best weights.
@@ -116,7 +116,7 @@ class Trainer(abc.ABC):
         """Return a loader of the batches from step `first` to the last step."""
 
     def pixels(self, batch: Any) -> int:
-        """Return the number of pixels in a batch, from which the speed is computed; 0: no speed."""
+        """Return the number of pixels in a batch, to compute the speed; with 0, none is shown."""
         return 0
 
     @abc.abstractmethod
@@ -140,7 +140,7 @@ class Trainer(abc.ABC):
         return read_notes(path)
 
     def export(self, folder: Path) -> Path | None:
-        """Write the best weights in another file format; return the file, None if there is none."""
+        """Write the best weights as an ONNX file; return its path, or None for a ranker."""
         return None
 
     def training_step(self, batch: Any, step: int) -> float:
@@ -165,13 +165,13 @@ class Trainer(abc.ABC):
             )
         for optimizer in self.optimizers:
             optimizer.step()
-        # The average decays faster at first, to forget the initial weights.
+        # At first, the decay is smaller, so that the average soon forgets the initial weights.
         decay = min(self.average_decay, (1 + step) / (10 + step))
         states = (module.state_dict().values() for module in (self.average, self.network))
         for mean, state in zip(*states, strict=True):
             if mean.is_floating_point():
                 mean.lerp_(state, 1 - decay)
-            else:  # an integer: batches that a batch normalisation has seen
+            else:  # an integer: the number of batches that a batch normalisation has seen
                 mean.copy_(state)
         return value
 

@@ -71,9 +71,9 @@ class SourceImage:
 
 
 def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """Return the normal and the dark views of an image: one of each size, then augmented ones.
+    """Return the normal and the dark views of an image: one of each size, then augmented views.
 
-    `name`, the image's relative path, is the seed of the random choices.
+    The seed of the random choices is `name`, the path of the image in its folder.
     """
     generator = np.random.default_rng(zlib.crc32(name.encode()))
     normal = tuple(View(side, None, options.square) for side in options.short_sides)
@@ -117,7 +117,7 @@ def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray
 
 
 def label_key(options: LabelOptions) -> str:
-    """Return a digest of the label settings, which determine a label together with the view."""
+    """Return a digest of the label settings. A label depends only on these and on the view."""
     names = options.detectors
     return key({n: [options.parameters(n, "normal"), options.parameters(n, "low")] for n in names})
 

@@ -1,4 +1,4 @@
-"""Crops of photographs that have a `Reading` of the teachers, with simulated camera effects."""
+"""Crops of photographs with simulated camera effects, and the teachers' outputs (`Reading`)."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ photographs of 480 pixels, so that they show about as much around a point as the
 number of points is limited because the loss compares all pairs of points."""
 
 TURNED_SHARE, CLEAN_SHARE = 0.15, 0.4
-"""Share of the crops that are rotated by any angle, and share without camera effects. They were
-chosen by hand, because upright photographs gained less when more crops were rotated or degraded."""
+"""Share of the crops that are rotated by any angle, and share without camera effects. Chosen by
+hand: with more rotated or degraded crops, training improved matches of upright images less."""
 
 FAR_SCALE = Effect(0.4, math.log(0.4), math.log(2.4))
 """The log scale of 40 % of the crops is drawn from this range, which is wider than `SCALE`, so that
 the network learns the same descriptors at any scale."""
 
 ATTEMPTS = 50
-"""Number of photographs to try per crop: some have no reading (teacher outputs). Chosen by hand."""
+"""Number of photographs to try per crop, because some have no reading. Chosen by hand."""
 
 
 class Crops(NamedTuple):
@@ -42,8 +42,8 @@ class Crops(NamedTuple):
         images: (B, S, S) uint8 degraded views; the teachers saw the photograph itself.
         positions: (B, N, 2) float32, in pixels.
         sizes: (B, N) float32 diameters, in pixels.
-        codes: (B, N, 192) float16 descriptors of the teachers; in losses, float32 and whitened.
-        survival: (B, N) float32, share of the photograph's points with a lower ALIKED score.
+        codes: (B, N, 192) float16 descriptors by the teachers; in losses, float32 and whitened.
+        survival: (B, N) float32, share of the reading's points that have a lower ALIKED score.
         turn: (B,) float32, the angle by which the photograph is rotated, in radians.
     """
 

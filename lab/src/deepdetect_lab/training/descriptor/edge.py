@@ -1,9 +1,9 @@
-"""The network of a descriptor with published teachers; it starts from EdgePoint2-L64 (MIT).
+"""The network of the descriptor that published networks teach; it starts as EdgePoint2-L64 (MIT).
 
 EdgePoint2 was trained on real pairs, with changes of season and light that synthetic views lack.
-Its maps are sampled at keypoints only, because a descriptor for every fourth pixel would take more
-time than the maps. From the same maps, the network predicts a score for each candidate keypoint:
-how well it would survive a change of light or view.
+`EdgeNetwork` samples its feature maps at keypoints only: a descriptor for every fourth pixel, as in
+EdgePoint2, would take more time than the maps. From the maps, it also predicts a score for each
+candidate keypoint: how well it would survive a change of light or view.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ EDGE_CHANNELS = (8, 16, 48, 64)
 weights of EdgePoint2-L64."""
 
 CONTEXT_CHANNELS, GROUP = 64, 16
-"""Channels of our map at 1/8 of an octave's size, and channels per group of its convolution. The
+"""Channels of the map at 1/8 of an octave's size, and channels per group of its convolution. The
 network would take 8 % more time without groups, and 6 % more with 96 channels."""
 
 HIDDEN = 128
 """Hidden units of the perceptron. With 160, a descriptor would take 4 % more time."""
 
 SCORE_CHANNELS = 8
-"""Channels of the scores, at 1/4 of an octave's size. Scores at 1/2 took 3 ms more per image."""
+"""Channels of the map of scores, at 1/4 of an octave's size. At 1/2, an image took 3 ms more."""
 
 VARIANCE = 1e-5
 """Added to the variances in image and batch normalisation, as the published weights expect."""
@@ -55,8 +55,8 @@ PUBLISHED = {
     "block_coarsest.second": "block3.layer.3",
     "block_coarsest.skip": "block3.skip",
 }
-"""Names of our layers, and of EdgePoint2's convolutions whose weights they start from. The layer
-after a convolution in a sequence `layer` is its batch normalisation."""
+"""Names of layers of `EdgeNetwork`, and of EdgePoint2's convolutions whose weights they start from.
+In a sequence called `layer`, each of these convolutions precedes its batch normalisation."""
 
 
 class Residual(nn.Module):
@@ -92,7 +92,7 @@ class EdgeNetwork(KeypointNetwork):
     """A network that describes and scores keypoints, and predicts the descriptors of its teachers.
 
     It takes luma images whose sides are multiples of 128. EdgePoint2's batch normalisation is
-    folded into its layers.
+    folded into the convolutions.
     """
 
     octaves = 3
@@ -138,7 +138,7 @@ class EdgeNetwork(KeypointNetwork):
         return result
 
     def scores(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
-        """Return scores (B, N) as logits. Candidates with higher scores survive changes better."""
+        """Return scores (B, N), logits, of candidates at positions (B, N, 2) with sizes (B, N)."""
         parts: list[Tensor] = []
         for octave, (quarter, eighth) in enumerate(maps):
             coarse = double(self.score_eighth(eighth.float()))
@@ -174,7 +174,7 @@ class EdgeNetwork(KeypointNetwork):
 
 
 def _folded(stored: dict[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
-    """Fold a convolution's batch normalisation into its kernel and bias; return these two."""
+    """Return a convolution's kernel and bias, with its batch normalisation, if any, folded in."""
     weight = stored[f"{name}.weight"]
     sequence, _, place = name.rpartition(".")
     if not place.isdigit():

@@ -1,4 +1,4 @@
-"""The contrastive loss of pairs of views, and the validation metric: correct mutual matches."""
+"""The contrastive loss of pairs of views, and the validation metric: shares of correct matches."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from .views import Pair
 
 NEAR_PX = 3.0
 """Two keypoints that are closer than this in either view are not negatives of each other in the
-loss. A match is correct in the metric if it lies within this distance of the true position."""
+loss. In the metric, a match is correct if it is closer than this to the true position."""
 
 MAX_LOG_TEMPERATURE = 4.3
+"""Maximum of log(1 / temperature): similarities are multiplied by at most 74. Chosen by hand."""
+
 UPRIGHT, ANGLE_NOISE = 0.45, 0.15
 """Pairs of views with a rotation below `UPRIGHT` radians count as upright. `ANGLE_NOISE` is the
 standard deviation, in radians, of simulated errors of keypoint angles. Both are chosen by hand."""
@@ -33,7 +35,7 @@ def kind_of(angle: float, zoom: float) -> str:
 
 
 def describe_views(network: KeypointNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
-    """Return descriptors (B, N, 64) of the keypoints of each view, without undoing any rotation."""
+    """Return descriptors (B, N, 64) of the keypoints of each view; rotations are not undone."""
     images = batch.images.transpose(0, 1).flatten(0, 1)
     positions = torch.cat([batch.positions0, batch.positions1])
     sizes = torch.cat([batch.sizes0, batch.sizes1])

@@ -20,8 +20,8 @@ from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, 
 from deepdetect.features.learned import CONSTANT, FREQUENCIES, LENGTH
 
 HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
-"""`HIDDEN` is the number of hidden units of the perceptron. The others are numbers of channels of
-feature maps at 1/2 of the image size (`HALF`) to 1/32 (`COARSEST`). Chosen by hand."""
+"""Numbers of channels of the feature maps, from 1/2 of an octave's size (`HALF`) to 1/32
+(`COARSEST`), and number of hidden units of the perceptron (`HIDDEN`). Chosen by hand."""
 
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
@@ -29,14 +29,17 @@ FIRST_OCTAVE_PX = 4.5
 maps of the two octaves nearest to its size are interpolated and used as well. Chosen by hand."""
 
 SMALLEST_SIZE_PX = 2.5
+"""Keypoints with a smaller diameter are described as if they had this one. Chosen by hand."""
+
 NOISE = 1 / 255
-"""Variations of the luma with about this standard deviation, one grey level, count as noise. So the
+"""One grey level of the luma. Variations with about this standard deviation count as noise: the
 normalisation by local contrast does not amplify them to full contrast."""
 
 CELL_PX, CELLS = 8, 5
-"""Local contrast is computed in a square of 5x5 cells of 8x8 pixels. Chosen by hand."""
+"""Local contrast is computed in a square of 5x5 cells of 8x8 pixels each. Chosen by hand."""
 
 BATCH_MOMENTUM = 0.1
+"""Share of the new batch in the running statistics at each step, the default of torch."""
 
 
 class Convolution(nn.Module):
@@ -89,7 +92,7 @@ class KeypointNetwork(nn.Module):
 
     Attributes:
         octaves: number of octaves of which `maps` makes feature maps.
-        strides: stride of each map of an octave, in pixels of the octave.
+        strides: pixels of the octave per pixel of each of its maps.
     """
 
     octaves: int
@@ -186,7 +189,7 @@ class DescriptorNetwork(KeypointNetwork):
 
 
 def shares_of_octaves(sizes: Tensor, octaves: int) -> tuple[Tensor, ...]:
-    """Return, per octave, its interpolation weights (B, N, 1) for keypoint sizes (B, N)."""
+    """Return, for each octave, its interpolation weights (B, N, 1) for diameters (B, N)."""
     sizes = sizes.clamp(min=SMALLEST_SIZE_PX)
     own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, octaves - 1)[..., None]
     shares = (1 - (own - torch.arange(octaves, device=sizes.device)).abs()).clamp(min=0)
@@ -194,7 +197,7 @@ def shares_of_octaves(sizes: Tensor, octaves: int) -> tuple[Tensor, ...]:
 
 
 def size_features(sizes: Tensor) -> Tensor:
-    """Return three features (B, N, 3) of keypoint sizes (B, N), as input of a perceptron."""
+    """Return three features (B, N, 3) of the logarithms of keypoint diameters (B, N) in pixels."""
     scale = (sizes.clamp(min=SMALLEST_SIZE_PX) / SMALLEST_SIZE_PX).log()[..., None]
     return torch.cat([scale - 0.7, (scale - 0.7) ** 2 - 0.3, (scale * 3).sin()], -1)
 

@@ -27,7 +27,8 @@ ONNX = "descriptor.onnx"
 
 REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
 """Each pair is used in `REUSE` steps on average, because drawing a pair takes longer than training
-on it. Steps choose from the last `WINDOW` pairs, at first from `FIRST_BATCHES` batches of pairs."""
+on it. Steps choose at random from the last `WINDOW` pairs drawn. About `FIRST_BATCHES` batches of
+pairs are drawn for the first step. Chosen by hand."""
 
 WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
 """The learning rate rises over `WARM_UP_STEPS` steps, but at most over the share `WARM_UP_SHARE` of
@@ -37,7 +38,8 @@ DECAY_SHARE = 0.65
 """The learning rate falls linearly to 0 over this last share of the steps. Chosen by hand."""
 
 VECTOR_RATE = 0.4
-"""AdamW trains parameters unsuited to Muon, at this fraction of Muon's rate. Chosen by hand."""
+"""Learning rate of AdamW, which trains parameters unsuited to Muon, divided by Muon's rate.
+Chosen by hand."""
 
 
 def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
@@ -50,7 +52,7 @@ def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
 def pairs_to_draw(
     options: DescriptorTrainingOptions, first: int, last: int
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yield each step with the numbers of its pairs that no step since `first` has used yet."""
+    """Yield each step from `first` on, with the numbers of its pairs that are not drawn yet."""
     drawn: set[int] = set()
     for step in range(first, last):
         wanted = set(pairs_of_step(options, step).tolist())
@@ -59,7 +61,7 @@ def pairs_to_draw(
 
 
 def draw_numbered(files: Sequence[Path], *seed: int) -> Pair:
-    """Draw the pair that a seed determines; raise an OptionError for images of little detail."""
+    """Draw a pair from a seed; raise an OptionError if the images have too little detail."""
     generator = np.random.default_rng(seed)
     return draw_until_seen(lambda: draw_pair(generator, files))
 
@@ -85,7 +87,7 @@ class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
 
 
 def validation_batches(files: Sequence[Path], options: DescriptorTrainingOptions) -> list[Pair]:
-    """Draw the batches of validation pairs, which are fixed: `val_pairs` of each of `KINDS`."""
+    """Draw the batches of validation pairs, `val_pairs` of each of `KINDS`, from a fixed seed."""
     pairs: dict[str, list[Pair]] = {kind: [] for kind in KINDS}
     number = 0
     while min(map(len, pairs.values())) < options.val_pairs:
@@ -163,7 +165,7 @@ class DescriptorTrainer(Trainer):
         return load_network(init_weights, self.kind_of_network)
 
     def rate_factor(self, name: str) -> float:
-        """Return the factor by which the learning rate is multiplied for a parameter."""
+        """Return the factor of the learning rate for the parameter with this name."""
         return 1.0
 
     def dataset(self) -> Dataset[Any]:

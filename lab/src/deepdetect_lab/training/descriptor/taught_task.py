@@ -1,4 +1,4 @@
-"""Training of a descriptor on readings of published networks and on pairs of synthetic views."""
+"""Training of a descriptor on outputs of published networks, and on pairs of synthetic views."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ BACKBONE_RATE = 0.5
 more of what EdgePoint2 learned from real pairs. Chosen by hand."""
 
 DECAY_SHARE = 0.82
-"""The learning rate falls linearly to 0 over this last share of the steps, a larger one than
-without teachers. In a run from trained weights, photos/val gained little in 1,300 steps at the
-highest rate, and more in the next 1,000 steps, in which the rate fell to 0.87 of that."""
+"""The learning rate falls linearly to 0 over this last share of the steps, which is larger than
+without teachers. In a run from trained weights, the measures on photos/val improved little in 1,300
+steps at the highest rate, and more in the next 1,000, while the rate fell to 0.87 of it."""
 
 VAL_CROPS = 8
-"""Number of validation batches of crops, each as large as that of a step. Chosen by hand."""
+"""Number of validation batches of crops, each as large as a step's batch. Chosen by hand."""
 
 
 class TaughtDataset(Dataset[tuple[tuple[int, list[int], Pair | None], Crops]]):
-    """The new pairs of each step, and crops of photographs that have a reading at that time."""
+    """The new pairs of each step, and crops of photographs whose readings are already written."""
 
     def __init__(
         self, files: Sequence[Path], options: DescriptorTrainingOptions, readings: Path
@@ -50,9 +50,9 @@ class TaughtDataset(Dataset[tuple[tuple[int, list[int], Pair | None], Crops]]):
 
 
 class TaughtTrainer(DescriptorTrainer):
-    """Training of an `EdgeNetwork` on pairs of views, and on readings of its teachers.
+    """Training of an `EdgeNetwork` on pairs of views, and on outputs of its teachers (readings).
 
-    If a run starts before all readings are written, its result depends on when each is written.
+    If readings are still being written during a run, its result depends on the times of writing.
     """
 
     purpose = (
@@ -90,7 +90,7 @@ class TaughtTrainer(DescriptorTrainer):
         super().__init__(images, validation, options, init_weights, device)
 
     def first_network(self, init_weights: str | Path | None) -> nn.Module:
-        """Return the network before the first step; a file L64.pth gives EdgePoint2's layers."""
+        """Return the network before the first step, with EdgePoint2's weights from a .pth file."""
         if init_weights is None or Path(init_weights).suffix != ".pth":
             return super().first_network(init_weights)
         network = seeded(EdgeNetwork, self.options.seed)
@@ -101,7 +101,7 @@ class TaughtTrainer(DescriptorTrainer):
         return BACKBONE_RATE if name.startswith(BACKBONE) else 1.0
 
     def dataset(self) -> Dataset[Any]:
-        """Return a dataset like that of a `DescriptorTrainer`, with the crops of each step."""
+        """Return a dataset of the new pairs and the crops of each step."""
         return TaughtDataset(self.files, self.options, self.readings)
 
     def loss(self, batch: tuple[tuple[int, list[int], Pair | None], Crops]) -> Tensor:  # type: ignore[override]

@@ -29,15 +29,16 @@ from ..synthetic import (
 
 KEYPOINTS = 256
 """A pair has at most this many keypoints, because the loss compares all keypoints of one view with
-all keypoints of the other view. This number is enough to fill a view."""
+all keypoints of the other view. 256 keypoints cover a view of 256x256 pixels."""
 
 LEAST_KEYPOINTS, LEAST_IF_ZOOMED, ZOOMED = 64, 40, 0.8
-"""Pairs whose views share fewer than `LEAST_KEYPOINTS` keypoints are drawn again, or fewer than
-`LEAST_IF_ZOOMED` if the absolute log zoom between them is above `ZOOMED`. Chosen by hand."""
+"""Pairs are drawn again if their views share fewer than `LEAST_KEYPOINTS` keypoints. If the
+absolute log zoom between views is above `ZOOMED`, `LEAST_IF_ZOOMED` are enough. Chosen by hand."""
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
-"""Candidates of the first view are used if their sigma is below `MAX_FIRST_SIGMA_PX`, but at most
-the `STRONGEST` best. Areas around larger candidates do not fit into a view of 256 pixels."""
+"""Candidates of the first view are used if their sigma is below `MAX_FIRST_SIGMA_PX`, because areas
+around larger candidates do not fit into a view of 256 pixels. At most the `STRONGEST` best are used
+(chosen by hand)."""
 
 SIGMA_RANGE_PX = (1.0, 13.0)
 """Keypoints are left out if their sigma in the second view is not in this range. Smaller keypoints
@@ -61,7 +62,8 @@ SIZE_ERRORS, SMALL_ERROR_SHARE = (0.12, 0.4), 0.6
 
 PLACE_ERROR_PX, PLACE_ERROR_PER_SIGMA, PLACE_ERROR_SIGMA = 0.225, 0.162, 6.0
 """Keypoint positions in the second view get random errors. Their standard deviation in pixels is
-`PLACE_ERROR_PX` + `PLACE_ERROR_PER_SIGMA` * min(`PLACE_ERROR_SIGMA`, sigma of the keypoint)."""
+`PLACE_ERROR_PX` + `PLACE_ERROR_PER_SIGMA` * min(`PLACE_ERROR_SIGMA`, sigma of the keypoint).
+Chosen by hand; not measured."""
 
 UNCHANGED_SHARE = 0.15
 """Share of the views without changes of light, blur, noise or compression. Chosen by hand."""
@@ -97,7 +99,7 @@ class Pair(NamedTuple):
         turns: rotation from the first view to the second at each keypoint, (N,) float32 radians.
         valid: (N,) bool, false for rows that are padding.
         turn, zoom: absolute rotation in radians, and absolute logarithm of the zoom, between the
-            views as a whole.
+            whole views.
     """
 
     images: Any
@@ -144,7 +146,7 @@ def draw_pair(rng: np.random.Generator, files: Sequence[Path]) -> Pair | None:
 
 
 def photograph_view(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
-    """Change light, sharpness and noise of an (S, S) float32 view in [0, 1]; return uint8."""
+    """Simulate light and a camera for an (S, S) float32 view in [0, 1]; return uint8."""
     if happens(rng, UNCHANGED_SHARE):
         return np.clip(view * WHITE, 0, WHITE).astype(np.uint8)
     view = blur(rng, relight(rng, view, LIGHT), CAMERA)

@@ -1,6 +1,6 @@
 """The validation metric of the ranker, on a fixed set of synthetic pairs.
 
-It combines the one-to-one repeatability of fixed numbers of keypoints (budgets) and the correct
+It combines the one-to-one repeatability for fixed numbers of keypoints (budgets) and the correct
 matches of upright descriptors. Keypoints where a view does not show the photograph are left out.
 """
 
@@ -30,6 +30,8 @@ MATCHING_BUDGET = 2048
 DESCRIPTOR_SIZE_PX = 4.0
 RATIO = 0.85
 SIDE_PX = 256
+"""Views have `SIDE_PX` pixels a side. RootSIFT describes keypoints with the diameter
+`DESCRIPTOR_SIZE_PX`, and matches pass the ratio test with `RATIO`. All are chosen by hand."""
 
 Detect = Callable[[np.ndarray], Keypoints]
 """A function from an (H, W) uint8 image to keypoints."""
@@ -78,7 +80,7 @@ def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
     means = np.array([np.mean(repeated[kind], axis=0) for kind in KINDS])
     matched = [float(np.mean(correct[kind])) for kind in KINDS]
     # The mean of `matched` counts double, because it includes pairs with zoom and rotation, in
-    # which upright descriptors find no matches.
+    # which upright descriptors find no matches. The weights are chosen by hand.
     score = 0.8 * means.mean(0).mean() + 0.2 * 2 * float(np.mean(matched))
     found = {"score": float(score)}
     for kind, fractions, share in zip(KINDS, means, matched, strict=True):

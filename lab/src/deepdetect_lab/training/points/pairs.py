@@ -18,12 +18,13 @@ from ..recipe import PointsTrainingOptions
 from .views import KINDS, ViewPair, draw_pair
 
 MAX_CANDIDATES = 2000
-"""A view has at most this number of candidates, the strongest ones. Chosen by hand."""
+"""Number of candidates of a view that are kept, the strongest ones. Chosen by hand."""
 
 REACH_PX = 3.0
 
 MIN_OVERLAP = 0.04
-"""Pairs whose views overlap by less than this fraction are drawn again. Chosen by hand."""
+"""Pairs whose views overlap by less than this fraction are drawn again, up to `ATTEMPTS` draws in
+total. Chosen by hand."""
 
 ATTEMPTS = 5
 
@@ -89,7 +90,7 @@ def _correspondences(
 ) -> tuple[np.ndarray, ...]:
     mapped = np.column_stack([here, np.ones(len(here))]) @ (homography / homography[2, 2]).T
     depth = mapped[:, 2:]
-    before = depth[:, 0] > 0  # other positions lie behind the camera
+    before = depth[:, 0] > 0  # all other positions lie behind the camera
     mapped = np.where(before[:, None], mapped[:, :2] / np.where(before[:, None], depth, 1), -1e6)
     height, width = valid.shape
     column, row = np.rint(np.clip(mapped, -1e6, 1e6)).astype(np.int64).T

@@ -31,15 +31,21 @@ STATISTICS_PAIRS = 64
 
 WARM_UP_STEPS = 100
 FINAL_RATE = 0.02
-"""Cosine annealing ends at this fraction of the highest learning rate. Chosen by hand."""
+"""The learning rate rises over `WARM_UP_STEPS` steps. Cosine annealing ends at the fraction
+`FINAL_RATE` of the highest rate. Chosen by hand."""
 
 WEIGHT_DECAY = 1e-4
+"""Weight decay of AdamW. Chosen by hand."""
 
 AVERAGE_DECAY = 0.995
-"""Decay per step of the exponentially averaged weights, which are saved. Chosen by hand."""
+"""Decay per step of the exponential average of the weights, which is saved. Chosen by hand."""
 
 HIDDEN_UNITS = (48, 32)
+"""Widths of the hidden layers. 96 and 48 units were no better on pairs from photos/val."""
+
 MIN_DEVIATION = 1e-3
+"""Features are divided by their standard deviation, or by this if it is larger. Chosen by hand."""
+
 INITIAL_OUTPUT = 0.01
 """The initial weights of the last layer are multiplied by this factor. The layer then gives values
 near 0, so an untrained ranker ranks by |det Hessian|."""
@@ -76,7 +82,7 @@ class RankerModule(nn.Module):
         return logits
 
     def export(self, notes: dict[str, Any]) -> Ranker:
-        """Return the same ranker without torch."""
+        """Return the same ranker as NumPy arrays, for use without torch."""
         layers = tuple(
             (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
             for layer in (self.first, self.second, self.output)

@@ -1,7 +1,7 @@
 """Synthetic pairs of views of one photograph, with the homography between them.
 
 Pairs have one of four kinds of change, as the Oxford scenes have: zoom and rotation, blur,
-viewpoint, or light and JPEG. Each kind also gets a little of the other changes.
+viewpoint, or light and JPEG. Pairs of each kind also get weak changes of the other kinds.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ KINDS = ("zoom", "blur", "viewpoint", "light")
 
 BORDER_PX = 4
 """Pixels of a view are not valid near the photograph's border, because mirrored pixels are close.
-The margin is the sum of this many pixels of the photograph and this many pixels of the view."""
+The margin is 4 pixels of the photograph plus 4 pixels of the view. Chosen by hand."""
 
 SUPERSAMPLING = 2
 """Views are rendered with twice the pixels along each side, so that they are not aliased."""
@@ -41,7 +41,8 @@ MAX_ENLARGEMENT = 2.2
 
 SUBTLE = 0.25
 """Probability that a view of another kind than "blur" is also blurred weakly. Views of other kinds
-than "light" get weak changes of light and weak JPEG compression as often. Chosen by hand."""
+than "light" get a weak change of light, and weak JPEG compression, with this probability each.
+Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),
@@ -79,7 +80,7 @@ class Change:
     Attributes:
         log_zoom: range of the logarithm of the zoom.
         turn_deg: the largest rotation in either direction, in degrees.
-        shift: the largest distance between the centres along each axis, in sides of the first view.
+        shift: the largest offset of the second view along each axis, in sides of the first view.
         any_turn: share of the pairs that are rotated by any angle, up to 180 degrees.
         tilt_deg: range of the tilt in degrees.
         still: share of the pairs with neither zoom nor rotation nor tilt.
@@ -107,17 +108,17 @@ CHANGES = {
 scenes: a viewpoint change of 60 degrees and a zoom of 4."""
 
 LEAST_LOG_ZOOM = math.log(1.3)
-"""The limit of the log zoom due to `MAX_ENLARGEMENT` is at least this. Chosen by hand."""
+"""`MAX_ENLARGEMENT` never limits the log zoom to less than this. Chosen by hand."""
 
 ROTATED_SHARE = 0.2
 """Share of the pairs in which one random rotation is added to both views. Chosen by hand."""
 
 FOCAL_SIDES = (1.2, 3.0)
-"""Focal lengths, in sides of the view: fields of view from 45 to 19 degrees. Chosen by hand."""
+"""Range of focal lengths in sides of the view, for fields of 45 to 19 degrees. Chosen by hand."""
 
 SHRUNK_SCALE, LEAST_SIDE_PX = 0.9, 8
 """If a view shows the photograph at a scale below `SHRUNK_SCALE`, the photograph is first shrunk to
-this scale by area averaging. Its sides keep at least `LEAST_SIDE_PX` pixels."""
+that scale by area averaging. Its sides keep at least `LEAST_SIDE_PX` pixels. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +231,7 @@ def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray
 
 
 def degrade(image: np.ndarray, kind: str, generator: np.random.Generator) -> np.ndarray:
-    """Degrade a view, (H, W) uint8: strongly as its kind says, and sometimes weakly in other ways.
+    """Degrade a view, (H, W) uint8: strongly by the change of its kind, sometimes weakly by others.
 
     The kind is "" for the better view of a pair, which is only degraded weakly.
     """

@@ -1,1 +1,1 @@
-"""Published descriptor networks, evaluated at our keypoints, as teachers of our own descriptor."""
+"""Published networks whose descriptors at DeepDetect's keypoints teach the learned descriptor."""

@@ -31,13 +31,14 @@ KERNEL, SAMPLES = 3, 16
 """Convolutions cover 3x3 pixels, and 16 samples make a descriptor, as in the published weights."""
 
 MULTIPLE = 32
-"""The network reduces an image by 32, so images are padded to multiples of 32 pixels."""
+"""The coarsest features have 1/32 of the image size, so images are padded to multiples of 32."""
 
 REACH = 0.25
 """Offsets of samples are at most a quarter of the map's longer side, as in the paper's code."""
 
 SCORE_WINDOW = 5
-"""A point gets the highest score within 2 px, since positions of two detectors differ by that."""
+"""A point gets the highest score in a window of 5x5 pixels, since the positions of its keypoint in
+DeepDetect and in ALIKED may differ. Chosen by hand."""
 
 
 class DeformableConvolution(nn.Module):
@@ -93,10 +94,10 @@ class DescriptorHead(nn.Module):
         self.agg_weights = nn.Parameter(torch.rand(SAMPLES, LENGTH, LENGTH))
 
     def forward(self, features: Tensor, xy: Tensor) -> Tensor:
-        """Return (N, 128) unit descriptors at positions (N, 2) in pixels of (1, 128, H, W)."""
+        """Return (N, 128) unit descriptors at (N, 2) pixel positions in features (1, 128, H, W)."""
         height, width = features.shape[2:]
-        # As in the published code: the pixel is the position without its fraction, and patches at
-        # the border are moved inwards, by one pixel more on the right and at the bottom.
+        # As in the published code, positions are rounded towards zero, and patches at the border
+        # are moved inwards, by one pixel more on the right and at the bottom.
         last = torch.tensor([width, height]) - 1 - KERNEL
         corner = (xy.trunc() - 0.5).long().clamp(min=0).minimum(last)
         across = torch.arange(KERNEL)
@@ -144,7 +145,7 @@ class Aliked(nn.Module):
         inside = (..., slice(top, top + height), slice(left, left + width))
         scores = self.score_head(features).sigmoid()[inside]
         features = features[inside]
-        # Four times as fast as `normalize`, whose sum over channels is slow on a CPU.
+        # This is four times as fast as `normalize`, whose sum over channels is slow on a CPU.
         return features * features.square().sum(1, keepdim=True).rsqrt(), scores
 
     @torch.no_grad()

@@ -25,8 +25,8 @@ from .aliked import load_aliked
 
 POINTS, STRONG_SHARE, STRONG_DENSITY = 1280, 0.5, 2048 / (640 * 480)
 """A reading has at most 1,280 points, because each takes 400 bytes. Half of them are drawn from the
-best-ranked points, as many per pixel as 2,048 in 640x480. The other half is drawn from all weaker
-points, because these are also described if 8,192 keypoints are requested."""
+best-ranked points, which are as dense as 2,048 points in 640x480 pixels. The other half is drawn
+from all weaker points, which are also described if 8,192 keypoints are requested."""
 
 EDGEPOINT_MULTIPLE = 32
 """EdgePoint2 takes images whose sides are multiples of 32, since it reduces them by this factor."""
@@ -56,8 +56,9 @@ CODE_LENGTHS = (64, 128)
 
 EDGEPOINT_WEIGHT, WHITENING = 0.6, 0.75
 """EdgePoint2's part of a whitened code has 0.6 times the length of ALIKED's part. Values along an
-axis are divided by their standard deviation to the power 0.75. At 2,048 points, webcam pairs have
-913 correct matches with both descriptors together if whitened, and 885 as published."""
+axis are divided by their standard deviation to the power 0.75. With both descriptors joined, pairs
+of webcam images with 2,048 points each have 913 correct matches (905 with the power 0.5, and 885
+without whitening, lab/HISTORY.md)."""
 
 SOME_READINGS, SOME_POINTS = 256, 80
 """Means and axes of the whitening are computed from about 80 points of each of 256 readings: 20,480
@@ -72,7 +73,7 @@ class Whitening:
     """A map from codes of both teachers to joint unit vectors (..., 192) with more even variances.
 
     Published codes of different points are similar, since their mean is not zero: two codes of
-    EdgePoint2 have a cosine of 0.55. With mean 0 and more even variances, more points match.
+    EdgePoint2 have a mean cosine of 0.55. With mean 0 and more even variances, more points match.
 
     Raises:
         OptionError: no reading is given.
@@ -104,8 +105,8 @@ class Whitening:
 class Teachers:
     """EdgePoint2-E64 and ALIKED-n16rot.
 
-    `edgepoint` is an ONNX file that maps `image` (1, 1, H, W), the mean of RGB in [0, 1], to
-    `descriptors` (1, 64, H/4, W/4). `aliked` is the authors' file of weights.
+    `edgepoint` is an ONNX file that maps `image` (1, 1, H, W), the mean of red, green and blue in
+    [0, 1], to `descriptors` (1, 64, H/4, W/4). `aliked` is the authors' file of weights.
     """
 
     def __init__(self, edgepoint: Path, aliked: Path) -> None:
@@ -133,7 +134,7 @@ class Teachers:
 
 
 def choose_points(gray: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Choose strong and weak keypoints at random, best first; return their positions and sizes."""
+    """Draw strong and weak keypoints; return positions (N, 2) and diameters (N,), best first."""
     candidates, logits = rank_candidates(build_scale_space(gray))
     kept = suppress_neighbors(candidates.xy, logits, least_distances(candidates.sigma_px))
     best = min(len(kept), round(STRONG_DENSITY * gray.size))
