@@ -23,7 +23,7 @@ from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import Images, found_in_each, load_image, load_pixels, load_visible, luma
 from .backends import RuntimeOptions, backend_name
 from .heatmap import MAX_AUTO_PIXELS, memory_named
-from .points.by_graph import detect_by_graph
+from .points.by_graph import detect_by_graph, open_points
 from .points.descriptor import DESCRIPTOR_GRAPHS, describe_batch, descriptor_type
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
@@ -58,7 +58,7 @@ class PointDetector:
         spread: how keypoints are chosen if there are more than `max_keypoints`. "none" takes those
             ranked highest. "grid" takes the best of each cell of a grid, then the second-best of
             each, and so on. "anms" takes good keypoints that are as far apart as possible.
-        min_logit: minimum `Keypoints.logits` of a keypoint. None: no limit. At 8, photographs have
+        min_logit: minimum `Keypoints.logits` of a keypoint. None: no limit. At 7.75, photographs have
             about as many keypoints as `cv2.SIFT` finds.
         upright: give all keypoints the angle 0, which keeps more matches of images that are not
             rotated relative to each other. Use this for programs that compare descriptors as they
@@ -127,6 +127,8 @@ class PointDetector:
                 f"`{name}` as given works only on the CPU: leave `backend` and `device` out, or "
                 f"change `{name}`"
             )
+        if self._by_graph:
+            open_points(self._runtime)
         self.threads = threads
         check_name("spread", spread, SPREADS)
         if spread != "none" and max_keypoints is None:

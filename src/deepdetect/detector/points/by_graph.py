@@ -10,9 +10,14 @@ import numpy as np
 from ...features.keypoints import Keypoints
 from ...io.image import at_pixels
 from ..backends import RuntimeOptions, open_graph
-from ..backends.interface import failed_run
+from ..backends.interface import Session, failed_run
 from ..pretrained import GRAY, MAX_KEYPOINTS, POINTS, POINTS_GRAPH
 from .detection import ranking_logits
+
+
+def open_points(runtime: RuntimeOptions) -> Session:
+    """Load the graph; a device that is not available raises an OptionError."""
+    return open_graph(POINTS_GRAPH, runtime, ((GRAY, MAX_KEYPOINTS), POINTS))
 
 
 def detect_by_graph(
@@ -27,7 +32,7 @@ def detect_by_graph(
     The keypoints are those of `detect_points`, up to rounding. `ignore` has a mask for each image.
     If too few keypoints are outside, the graph runs again for twice as many.
     """
-    session = open_graph(POINTS_GRAPH, runtime, ((GRAY, MAX_KEYPOINTS), POINTS))
+    session = open_points(runtime)
     images = np.stack(grays)[:, None].astype(np.float32)
     visible = min(1.0 if mask is None else 1 - np.mean(mask != 0) for mask in ignore)
     count, short = math.ceil(max_keypoints / max(visible, 1 / 8)), True

@@ -16,7 +16,7 @@ MAX_DEVIATIONS, CHUNK = 6.0, 2048
 """Features are clipped at MAX_DEVIATIONS standard deviations from their mean. CHUNK candidates are
 ranked at a time, so that their features stay in the processor's cache. Chosen by hand."""
 
-LOGIT_AS_SIFT = 8.0
+LOGIT_AS_SIFT = 7.75
 """Keypoints with at least this logit are about as many as those of `cv2.SIFT_create()`: as many in
 the geometric mean over photographs of photos/val, with a standard deviation of a factor of 1.6."""
 
