@@ -55,7 +55,7 @@ SHARED_CAMERA = replace(MANY, more="single_camera")
 ONNX = cli.From(
     OnnxOptions,
     "size",
-    types={"size": str | None},
+    types={"size": str | None, "descriptor": str | None},
     defaults={"size": "any; give one such as 480x640 to fix it"},
 )
 Sources = Annotated[
@@ -221,13 +221,14 @@ def onnx(
     WEIGHTS are default, dense, free, espnet, an ONNX file that this command wrote without --size,
     or a .safetensors file, which needs torch. The input `image` is RGB from 0 to 1. The outputs are
     `probability` and `logits` of each pixel, and the points of --detector points: `keypoints`,
-    `scores`, `sizes`, `angles`. docs/other-programs.md says which file suits which runtime.
+    `scores`, `sizes`, `angles`, and perhaps their `descriptors`. docs/other-programs.md says which
+    file suits which runtime.
 
         deepdetect export onnx -o deepdetect.onnx
         deepdetect export onnx dense -o dense-480x640.onnx --size 480x640 --max-keypoints 0
         deepdetect export onnx run/best.safetensors -o own.onnx
         deepdetect export onnx -o maps.onnx --max-keypoints 0
-        deepdetect export onnx -o points.onnx --no-maps
+        deepdetect export onnx -o points.onnx --no-maps --descriptor learned
 
     Args:
         weights: Name or file of the weights.

@@ -58,8 +58,8 @@ class PointDetector:
         spread: how keypoints are chosen if there are more than `max_keypoints`. "none" takes those
             ranked highest. "grid" takes the best of each cell of a grid, then the second-best of
             each, and so on. "anms" takes good keypoints that are as far apart as possible.
-        min_logit: minimum `Keypoints.logits` of a keypoint. None: no limit. At 7.75, photographs have
-            about as many keypoints as `cv2.SIFT` finds.
+        min_logit: minimum `Keypoints.logits` of a keypoint. None: no limit. At 7.75, photographs
+            have about as many keypoints as `cv2.SIFT` finds.
         upright: give all keypoints the angle 0, which keeps more matches of images that are not
             rotated relative to each other. Use this for programs that compare descriptors as they
             are, such as `cv2.BFMatcher`; `match_features` does about as well without it.

@@ -15,6 +15,7 @@ from .._shared.image_array import Channels
 from .._shared.machine import limited_threads, require_memory
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
+from ..detector.backends import RuntimeOptions
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
 from ..features.keypoints import Keypoints, nearest_keypoints
 from ..features.learned import is_learned, match_learned, ratio_limit
@@ -31,6 +32,7 @@ from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, at_pixels, load_pair
 from ..io.projection import require_pinhole
+from .by_graph import match_by_graph
 from .guided import Explanation, ImagePair
 from .overlay import scene_of, still_matches, tell_still
 
@@ -139,6 +141,8 @@ def match_features(
     ratio: float | None = None,
     mutual: bool = True,
     seed: int = 0,
+    backend: str = "auto",
+    device: str = "cpu",
 ) -> Matches:
     """Match two images by the descriptors of their keypoints alone, as `extract` returns them.
 
@@ -156,6 +160,8 @@ def match_features(
             0.85 for all others. These limits are equally strict.
         mutual: keep only mutual nearest neighbours.
         seed: seed of a randomised matcher.
+        backend, device: what compares learned descriptors, as in `PointDetector`. Other values than
+            these need the matcher "auto" or "exact", and memory on the device for all distances.
 
     Returns:
         The matches, without a geometry (see `estimate_geometry`). Their scores are 1 - ratio or,
@@ -194,14 +200,20 @@ def match_features(
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
     check_memory([len(features0), len(features1)])
     alike = features0.sizes is None and features1.sizes is None  # keypoints share scale and angle
-    nearest = partial(
+    limits: dict[str, Any] = {"ratio": math.inf if by_neighbours else ratio, "mutual": mutual}
+    nearest: Callable[[np.ndarray, np.ndarray], DescriptorMatches] = partial(
         match_descriptors,
         matcher=get_matcher(matcher),
-        ratio=math.inf if by_neighbours else ratio,
-        mutual=mutual,
         seed=seed,
         positions=(features0.xy, features1.xy) if alike else None,
+        **limits,
     )
+    if (backend, device) != ("auto", "cpu"):
+        if not learned or matcher not in ("auto", "exact"):
+            raise OptionError(
+                "`backend` and `device` need learned descriptors and exact search: leave them out"
+            )
+        nearest = partial(match_by_graph, runtime=RuntimeOptions(backend, device), **limits)
 
     def match(first: np.ndarray, second: np.ndarray) -> DescriptorMatches:
         found = nearest(first, second)

@@ -14,7 +14,7 @@ onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting on
 
 import onnxruntime  # noqa: E402
 
-from deepdetect import PointDetector, load_image  # noqa: E402
+from deepdetect import OptionError, PointDetector, load_image  # noqa: E402
 from deepdetect.detector.onnx_files.export import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import POINTS  # noqa: E402
 
@@ -36,8 +36,8 @@ def planes_of(*images: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.stack(images).transpose(0, 3, 1, 2) * np.float32(1 / 255))
 
 
-def open_in(runtime: str, path: Path) -> Run:
-    """Return what computes keypoints, scores, sizes and angles of images."""
+def open_in(runtime: str, path: Path, outputs: tuple[str, ...] = POINTS) -> Run:
+    """Return what computes outputs of a file, by default keypoints, scores, sizes and angles."""
     if runtime.startswith("openvino"):
         openvino = pytest.importorskip("openvino", reason="needs OpenVINO")
         core, settings = openvino.Core(), {"INFERENCE_NUM_THREADS": 1}
@@ -49,13 +49,13 @@ def open_in(runtime: str, path: Path) -> Run:
 
         def run(images: np.ndarray) -> list[np.ndarray]:
             found = model([images])
-            return [found[name] for name in POINTS]
+            return [found[name] for name in outputs]
 
         return run
     settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads, settings.log_severity_level = 1, 4
     session = onnxruntime.InferenceSession(str(path), settings)
-    return lambda images: session.run(POINTS, {"image": images})
+    return lambda images: session.run(outputs, {"image": images})
 
 
 @pytest.fixture(scope="module")
@@ -171,3 +171,42 @@ def test_photographs(run: Run, shared: Path) -> None:
     shares = [share(run(planes_of(rgb)), 0, rgb) for rgb in crops]
     assert min(shares) >= LEAST_SHARE
     assert np.mean(shares) > 0.99
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino"])
+@pytest.mark.parametrize("descriptor", ["learned", "learned-free"])
+def test_descriptors_beside_points(
+    runtime: str, descriptor: str, tmp_path: Path, photo: np.ndarray
+) -> None:
+    path = tmp_path / "described.onnx"
+    written = write_onnx("default", path, OnnxOptions(max_keypoints=200, descriptor=descriptor))
+    assert written["descriptor"] == descriptor
+    images = [photo[:123, :157], photo[100:223, 60:217].copy()]
+    images[1][:, 30:] = 128  # fewer points
+    run = open_in(runtime, path, (*POINTS, "descriptors"))
+    xy, scores, sizes, _, codes = run(planes_of(*images))
+    assert codes.shape == (2, 200, 64)
+    assert (scores[1] == 0).any()
+    assert not codes[scores == 0].any()
+    for k, image in enumerate(images):
+        expected = PointDetector(200, descriptor=descriptor).extract(image)
+        places = np.column_stack([expected.xy, expected.sizes])
+        found = scores[k] > 0
+        distances, nearest = cKDTree(np.column_stack([xy[k], sizes[k]])[found]).query(places)
+        same = distances < NEAR_PX
+        assert same.mean() > LEAST_SHARE
+        alike = (codes[k][nearest[same]] * expected.descriptors[same]).sum(axis=1)
+        assert np.quantile(alike, 0.05) > 0.999
+    # The network alone can be taken out of the file again.
+    write_onnx(path, tmp_path / "maps.onnx", OnnxOptions(max_keypoints=0))
+    write_onnx("default", tmp_path / "plain.onnx", OnnxOptions(max_keypoints=0))
+    maps, plain = (onnx.load(tmp_path / f"{name}.onnx").graph for name in ("maps", "plain"))
+    assert maps == plain
+
+
+@pytest.mark.parametrize(
+    "options", [{"descriptor": "rootsift"}, {"descriptor": "learned", "max_keypoints": 0}]
+)
+def test_descriptors_that_no_file_can_give(options: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match="descriptor"):
+        OnnxOptions(**options)

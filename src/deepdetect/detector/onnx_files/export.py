@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 
 from ..._shared.atomic import atomic_path
 from ..._shared.errors import OptionError, WeightsError, require_packages
-from ..._shared.options import check_ranges, suggest_keywords
+from ..._shared.options import check_ranges, names_a_file, suggest_keywords
+from ...features.learned import LEARNED, LEARNED_FREE
 from ...features.selection import check_max_keypoints
+from ..points.descriptor import descriptor_type
 from ..pretrained import LOGITS, resolve_weights
 from .graph import IMAGE, PROBABILITY, fix_size, read_metadata, replace_nodes, write_metadata
 from .points import add_points, remove_points
@@ -37,6 +39,8 @@ class OnnxOptions:
         maps: include the outputs `probability` and `logits`, the network's maps of all pixels.
         max_keypoints: also output this many keypoints of all scales, as `PointDetector` finds them.
             0: none. OpenCV needs 0, because it rejects files with keypoints.
+        descriptor: also output descriptors of the keypoints: "learned", "learned-free", or an ONNX
+            file that `deepdetect train-descriptor` wrote. None: no descriptors.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -46,6 +50,7 @@ class OnnxOptions:
     batch: int = 1
     maps: bool = True
     max_keypoints: int = 2048
+    descriptor: str | Path | None = None
 
     def __post_init__(self) -> None:
         if self.size is not None and len(self.size) != 2:
@@ -54,6 +59,14 @@ class OnnxOptions:
         check_ranges(self, counts=("size", "batch"), between=ranges)
         if self.max_keypoints or not self.maps:
             check_max_keypoints(self.max_keypoints)
+        if self.descriptor is not None:
+            if not self.max_keypoints:
+                raise OptionError("`descriptor` needs `max_keypoints` above 0")
+            if self.descriptor not in (LEARNED, LEARNED_FREE) and not names_a_file(self.descriptor):
+                raise OptionError(
+                    f"`descriptor` is {LEARNED!r}, {LEARNED_FREE!r} or a file, not "
+                    f"{self.descriptor!r}"
+                )
         if self.batch > 1 and self.size is None:
             raise OptionError(
                 "`batch` needs `size`: a file for any size takes any number of images"
@@ -68,6 +81,8 @@ class OnnxOptions:
             values |= {"size": f"{height}x{width}", "batch": str(self.batch)}
         if self.max_keypoints:
             values["max_keypoints"] = str(self.max_keypoints)
+        if self.descriptor:
+            values["descriptor"] = descriptor_type(self.descriptor)
         return values
 
 
@@ -105,7 +120,7 @@ def write_model(
         replace_nodes(model.graph, [])
         del model.graph.output[:]
     if options.max_keypoints:
-        add_points(model, options.max_keypoints)
+        add_points(model, options.max_keypoints, options.descriptor)
     write_metadata(model, {**options.metadata, **origin})
     with atomic_path(path) as temporary:
         temporary.write_bytes(model.SerializeToString())
