@@ -58,7 +58,8 @@ def chosen_detector(
     network, points, selection = (source.take(values) for source in (NETWORK, options, SELECTION))
     if kind == "points":
         points["max_keypoints"] = selection.pop("max_keypoints", max_keypoints)
-        points["resolution"] = network.pop("resolution", "auto")
+        shared = network.keys() & {"resolution", "backend", "device", "threads"}
+        points |= {name: network.pop(name) for name in shared}
     for name in (*network, *selection) if kind == "points" else points:
         other = "network" if kind == "points" else "points"
         raise OptionError(
