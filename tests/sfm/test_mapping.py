@@ -173,6 +173,25 @@ def test_a_model_whose_camera_ran_away_is_made_again(run_away, tmp_path: Path) -
     assert all(view.camera.focal_px == pytest.approx((500, 500), rel=0.05) for view in views)
 
 
+def test_two_images_with_a_wrong_focal_length_are_not_the_end(
+    pycolmap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, fixed = pycolmap.incremental_mapping, []
+
+    def mapper(database, folder, space, how, **named):
+        fixed.append(not how.ba_refine_focal_length)
+        return original(database, folder, space, how, **named) if fixed[-1] else {}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapper)
+    write_scenes(tmp_path / "database.db", {"aside": (ASIDE, 4)})
+    verified = verify_pairs(tmp_path / "database.db")
+    model, _ = map_images(tmp_path / "database.db", tmp_path, verified, False)
+    assert fixed == [False, False, True]
+    views = read_sparse_model(model).views.values()
+    assert len(views) == 4
+    assert all(view.camera.focal_px == pytest.approx((500, 500), rel=0.001) for view in views)
+
+
 @pytest.mark.parametrize(
     ("mapper", "name"),
     [(map_images, "incremental_mapping"), (map_globally, "global_mapping")],

@@ -155,14 +155,18 @@ def map_images(
         how.extract_colors, how.ignore_watermarks = False, True
         how.random_seed = seed
         if known_cameras:
-            how.ba_refine_focal_length = False
-            how.ba_refine_extra_params = False
             how.max_focal_length_ratio = np.inf  # COLMAP's limit is too low for telescopes
+        usual = how.mapper.init_max_forward_motion, how.mapper.init_min_tri_angle
+        forward = 1.0, FORWARD_ANGLE_DEG
+        attempts = [(usual, known_cameras), (forward, known_cameras)]
+        # Two images alone may give a wrong focal length, with which no third image fits.
+        attempts += [] if known_cameras else [(usual, True)]
         found, tried = list[Any](), list[Any]()
-        for forward in (False, True):
-            if forward:
-                how.mapper.init_max_forward_motion = 1.0
-                how.mapper.init_min_tri_angle = FORWARD_ANGLE_DEG
+        for first_pair, fixed in attempts:
+            if fixed and not known_cameras and any(_size(each) >= MIN_VIEWS for each in tried):
+                break
+            how.mapper.init_max_forward_motion, how.mapper.init_min_tri_angle = first_pair
+            how.ba_refine_focal_length = how.ba_refine_extra_params = not fixed
             with tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
                 models = pycolmap.incremental_mapping(
                     database,
