@@ -65,6 +65,22 @@ def test_refinement_makes_a_pose_from_noise_better() -> None:
     assert fine.errors[fine.inliers].max() < 1 <= fine.errors[~fine.inliers].min()
 
 
+def test_exact_matches_count_more_than_others() -> None:
+    """Half of the matches are exact across one axis only; their covariances tell which."""
+    points0, points1 = true_matches(0, 0, 400)
+    covariances = np.tile(np.diag([0.09, 0.09]), (400, 1, 1))
+    covariances[::2, 1, 1] = 0
+    errors = []
+    for seed in range(5):
+        noise = np.random.default_rng(seed).normal(0, 0.3, points1.shape)
+        noise[::2, 1] = 0
+        for known in (None, covariances):
+            pose = estimate_relative_pose(points0, points1 + noise, CALIBRATION, covariances=known)
+            errors.append((rotation_error(pose.rotation), direction_error(pose.translation)))
+    equal, weighted = np.reshape(errors, (5, 2, 2)).mean(axis=0)
+    assert (weighted < 0.5 * equal).all()
+
+
 def test_is_the_same_for_a_seed() -> None:
     matches = true_matches(0.3, 0.3)
     one, same, other = (

@@ -28,6 +28,9 @@ MAX_ITERATIONS, DERIVATIVE_STEP, MIN_GAIN = 20, 1e-6, 1e-7
 fraction MIN_GAIN. Numerical derivatives of the matrix vary each parameter by DERIVATIVE_STEP.
 Chosen by hand."""
 
+MIN_SIGMA_PX = 0.03
+"""Added to the standard deviations of matches from their covariances, since no match is exact."""
+
 MAX_REFITS, MIN_INLIER_GAIN = 4, 0.01
 """A pose is refitted to its inliers at most MAX_REFITS times, while their number grows by more than
 the fraction MIN_INLIER_GAIN. Chosen by hand."""
@@ -157,11 +160,30 @@ def estimate_relative_pose(
     calibration: Calibration,
     inlier_threshold: float = 1.0,
     seed: int = 0,
+    covariances: np.ndarray | None = None,
 ) -> RelativePose | None:
-    """Estimate the relative pose from (M, 2) matches in pixels, by MAGSAC and a refinement.
+    """Estimate the pose of the second of two calibrated cameras, by MAGSAC and a refinement.
 
-    The threshold is a Sampson distance in pixels. Returns None if there are too few matches or the
-    estimation fails.
+    Args:
+        points0, points1: (M, 2) matching positions in pixels of the images. The centre of the first
+            pixel is (0, 0).
+        calibration: both cameras, without distortion.
+        inlier_threshold: maximum Sampson distance of an inlier in pixels.
+        seed: seed of the random samples.
+        covariances: (M, 2, 2) of `points1` in square pixels, such as `Matches.covariances` after
+            `refine_matches`. The refinement weights matches by them. None: equal weights.
+
+    Returns:
+        The pose; None if there are too few matches or the estimation fails.
+
+    Example:
+        >>> from deepdetect.geometry.camera import Calibration, Camera
+        >>> camera = Camera((640, 480), 500.0)
+        >>> points = np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 8), (50, 3))
+        >>> first, second = camera.project(points), camera.project(points - [0.5, 0, 0])
+        >>> pose = estimate_relative_pose(first, second, Calibration(camera, camera))
+        >>> pose.translation.round(3) + 0.0
+        array([-1.,  0.,  0.])
     """
     matrices = calibration.camera0.matrix, calibration.camera1.matrix
     essential = GeometryOptions(inlier_threshold, None, *matrices)
@@ -179,7 +201,8 @@ def estimate_relative_pose(
     for _ in range(MAX_REFITS):
         before = np.count_nonzero(kept)
         inliers = points0[kept], points1[kept]
-        pose = refine_pose(*inliers, calibration, *pose, scale_px=inlier_threshold)
+        known = None if covariances is None else covariances[kept]
+        pose = refine_pose(*inliers, calibration, *pose, inlier_threshold, known)
         errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
         kept = errors < inlier_threshold
         if np.count_nonzero(kept) <= before * (1 + MIN_INLIER_GAIN):
@@ -198,20 +221,28 @@ def refine_pose(
     rotation: np.ndarray,
     translation: np.ndarray,
     scale_px: float = 1.0,
+    covariances: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine a pose by the Sampson distances of (M, 2) matches, most of them correct.
 
     A Cauchy loss is minimised over five angles: three of the rotation and two of the direction of
     the translation. The loss never rises above that of the initial pose. A match with a Sampson
-    distance of `scale_px` / 2 has half the weight of an exact match.
+    distance of `scale_px` / 2, or of twice its standard deviation if `covariances` of `points1` are
+    given, has half the weight of an exact match.
     """
     points0, points1 = _evenly(points0), _evenly(points1)
     pose = rotation, translation / np.linalg.norm(translation)
+    sigmas = np.full(len(points0), scale_px / 4)
+    if covariances is not None:
+        lines = np.column_stack([points0, np.ones(len(points0))])
+        lines = (lines @ fundamental_matrix(calibration, *pose).T)[:, :2]
+        across = np.einsum("ni,nij,nj->n", lines, _evenly(covariances), lines)
+        sigmas = np.sqrt(across / (lines**2).sum(axis=1).clip(np.finfo(float).tiny)) + MIN_SIGMA_PX
     return fit_to_lines(
         pose,
         points0,
         points1,
-        np.full(len(points0), scale_px / 4),
+        sigmas,
         lambda pose: fundamental_matrix(calibration, *pose),
         moved_pose,
         np.eye(5),

@@ -36,7 +36,7 @@ SAMPLE = 128
 CERTAIN = 0.95
 """Patches that correlate this well are not aligned again from another affine map. Set by hand."""
 
-MIN_SIGMA_PX = 0.05
+MIN_SIGMA_PX = 0.03
 """Minimum standard deviation of an aligned position along each axis. Chosen by hand."""
 
 POINT_SIGMA_PX, PIXEL_SIGMA_PX = 1.0, 0.35
@@ -104,9 +104,7 @@ def refine_matches(
     starts = [*_first_affinities(matches)]
     sigmas = _sigmas(grays, points0, points1, starts)
     found = _aligned(grays, sigmas, points0, points1, starts)
-    # After a Gaussian blur, the noise of 4 pi sigma^2 pixels counts as one independent value.
-    correlated = 4 * np.pi * (BASE_SIGMA_PX**2 + max(sigmas) ** 2)
-    measured = correlated * found.covariances + MIN_SIGMA_PX**2 * np.eye(2)
+    measured = _correlated(sigmas) * found.covariances + MIN_SIGMA_PX**2 * np.eye(2)
     exact = PIXEL_SIGMA_PX if matches.keypoints1.sizes is None else POINT_SIGMA_PX
     known = exact**2 * np.eye(2)
     moved, inverse = found.points1 - points1, np.linalg.inv(measured + known)
@@ -155,6 +153,20 @@ def _sigmas(
             if np.median((likeness[way] - likeness[best])[known]) > 0:
                 best = way
     return ways[best]
+
+
+def _correlated(sigmas: tuple[float, float]) -> float:
+    """Return the factor by which blurred, and so correlated, noise raises variances of positions.
+
+    White noise of the two images is blurred by s0 and s1, and their content by the larger one, S.
+    If the power spectrum of the content falls with the squared frequency, as that of photographs
+    does, the least-squares position gets S^2 / (S^2 + s^2) of each noise's variance before its
+    blur, and the pixels have 1 / (4 pi s^2) of it.
+    """
+    squares = np.square(sigmas) + BASE_SIGMA_PX**2
+    return float(
+        4 * np.pi * (squares.max() / (squares.max() + squares)).sum() / (1 / squares).sum()
+    )
 
 
 def _aligned(
