@@ -38,7 +38,7 @@ CERTAIN = 0.95
 
 MIN_SIGMA_PX = 0.03
 """Minimum standard deviation of an aligned position along each axis: errors of interpolation. On
-synthetic views, the median error is 1.07 of the covariances' standard deviations (1.18 is exact)."""
+synthetic views, the median error is then 1.07 standard deviations (1.18 would be exact)."""
 
 POINT_SIGMA_PX, PIXEL_SIGMA_PX = 1.0, 0.35
 """Standard deviation along each axis of unrefined matches: of keypoints with sizes, and of those on
