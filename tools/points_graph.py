@@ -32,6 +32,7 @@ from deepdetect.detector.points.candidate_features import (
     STRENGTH_FLOOR,
     ring_offsets,
 )
+from deepdetect.detector.points.descriptor import STRIDE
 from deepdetect.detector.points.detection import (
     CANDIDATES_PER_KEYPOINT,
     MIN_CANDIDATES,
@@ -48,8 +49,17 @@ from deepdetect.detector.points.hessian_scales import (
     VARIANCES,
 )
 from deepdetect.detector.points.ranker import MAX_DEVIATIONS, load_ranker
-from deepdetect.detector.pretrained import GRAY, MAX_KEYPOINTS, POINTS, POINTS_GRAPH, PREFIX
+from deepdetect.detector.pretrained import (
+    DESCRIBING,
+    DESCRIPTORS,
+    GRAY,
+    MAX_KEYPOINTS,
+    POINTS,
+    POINTS_GRAPH,
+    PREFIX,
+)
 from deepdetect.features.kernels import ATAN, BINS, RADIUS_PER_WINDOW
+from deepdetect.features.learned import CONSTANT, FREQUENCIES, LENGTH
 from deepdetect.features.selection import MAX_OFFSET_PX
 
 OPSET, IR_VERSION = 17, 8
@@ -64,6 +74,9 @@ REACH_PER_SIGMA = 4
 
 FIRST, LAST = 1, len(SIGMAS_PX) - 3
 """First and last level that has candidates."""
+
+UPRIGHT = f"{DESCRIBING}descriptors"
+"""Name of the descriptors before their rotation, which a network computes."""
 
 MARGIN = int(NMS_RADII.max()) + 1
 """Radius in pixels of the patch that is read around a candidate: that of the largest window of
@@ -109,10 +122,37 @@ def points_model() -> onnx.ModelProto:
     x, y, scores, sizes, level = choose(*rank_candidates(levels, limit), count)
     xy = graph.join([x.Unsqueeze([2]), y.Unsqueeze([2])], axis=2)
     angles = scores.Greater(0.0).Where(directions(levels, x, y, level), 0.0)
-    tensors = xy, scores, sizes, angles
-    shapes = [["batch", "count", *last] for last in ([2], [], [], [])]
-    outputs = [(name, FLOAT, shape) for name, shape in zip(POINTS, shapes, strict=True)]
-    return graph.model([("image", FLOAT, ["batch", 3, "height", "width"])], outputs, tensors)
+    found = scores.Greater(0.0)
+    tensors = xy, scores, sizes, angles, described(graph, gray, xy, sizes, angles, found)
+    shapes = [["batch", "count", *last] for last in ([2], [], [], [], [LENGTH])]
+    names = *POINTS, DESCRIPTORS
+    outputs = [(name, FLOAT, shape) for name, shape in zip(names, shapes, strict=True)]
+    inputs = ("image", FLOAT, ["batch", 3, "height", "width"]), (UPRIGHT, FLOAT, shapes[-1])
+    return graph.model(inputs, outputs, tensors)
+
+
+def described(graph: Graph, gray: Tensor, xy: Any, sizes: Any, angles: Any, found: Any) -> Any:
+    """Name the inputs of a descriptor's network; return its descriptors rotated by the angles.
+
+    The luma is padded as in `describe_batch`, and descriptors are rotated as by `turn_descriptors`.
+    """
+    graph.prefix = DESCRIBING
+    height, width = (gray.Shape(start=axis, end=axis + 1) for axis in (2, 3))
+    luma, ends = gray / 255.0, (height, width)
+    for axis, side in zip((2, 3), ends, strict=True):
+        period = (side * 2 - 2).Max([1])
+        last = ((side + (STRIDE - 1)) / STRIDE * STRIDE).Squeeze()
+        places = graph.add("Range", 0, last, 1).Mod(period)
+        luma = luma.Gather(places.Min(period - places), axis=axis)
+    for tensor, name in ((luma, "luma"), (xy, "xy"), (sizes.Max(1.0), "sizes")):
+        graph.named(tensor, DESCRIBING + name)
+    turns = (angles * (-np.pi / 180)).Unsqueeze([2]) * (FREQUENCIES * 1.0)
+    cosine, sine = turns.Cos(), turns.Sin()
+    upright, middle = Tensor(graph, UPRIGHT), CONSTANT + len(FREQUENCIES)
+    parts = (0, CONSTANT), (CONSTANT, middle), (middle, LENGTH)
+    constant, real, imaginary = (upright.Slice([start], [end], [2]) for start, end in parts)
+    turned = real * cosine - imaginary * sine, real * sine + imaginary * cosine
+    return found.Unsqueeze([2]).Where(graph.join([constant, *turned], axis=2), 0.0)
 
 
 def candidates_model() -> onnx.ModelProto:

@@ -39,6 +39,10 @@ POINTS = "keypoints", "scores", "sizes", "angles"
 PREFIX = "points/"
 """The names of all other tensors in `POINTS_GRAPH`, except for its input, start with this."""
 
+DESCRIPTORS, DESCRIBING = "descriptors", "descriptor/"
+"""A further output of `POINTS_GRAPH`, and the start of the names of tensors between it and the
+points. It needs the descriptors before their rotation, which a network computes."""
+
 MAX_KEYPOINTS, GRAY = f"{PREFIX}max_keypoints", f"{PREFIX}gray"
 """Tensors of `POINTS_GRAPH`: the maximum number of keypoints, (1,) int64, which is an initializer,
 and the luma from 0 to 255, (B, 1, H, W) float32."""
