@@ -17,8 +17,15 @@ import numpy as np
 from ..._shared.opencv import cv2
 from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches
+from ...geometry.alignment import Alignment, align_patches
 from ...geometry.estimation import GeometryOptions, estimate_geometry
-from ...geometry.images import MAX_ROUND_TRIP_PX, equalise, track_round_trip, warp_to_reference
+from ...geometry.images import (
+    MAX_ROUND_TRIP_PX,
+    equalise,
+    gaussian_blur,
+    track_round_trip,
+    warp_to_reference,
+)
 from ...geometry.transforms import scaled_homography, scaled_points, transform_points
 from .image_pair import ImagePair, Pair
 from .judge import Evidence, Judge
@@ -39,6 +46,10 @@ validated has SQUARES squares along the longer side of the image. Chosen by hand
 MAX_PARALLAX = 0.1
 """A tentative match is not tracked if it ends farther than this fraction of the longer side from
 where the homography maps it: the views differ too much there. Chosen by hand."""
+
+ALIGNMENT, BLUR_PX = Alignment(radius_px=7, max_shift_px=2.0, convergence_px=0.02, cubic=False), 0.8
+"""Tracks are refined by aligning a patch of the first image, after a blur of both. On planes of
+synthetic pairs, this halves the error of homographies. Patches are as in `refine_matches`."""
 
 NOISE_PX = 1.0
 """A track is on the plane if it ends nearer than this, three times its error, to its prediction."""
@@ -106,15 +117,15 @@ class PlaneTracks:
             self._ends = transform_points(self._ends, np.linalg.inv(sharp))
 
     def _validated(self) -> bool:
-        """Return whether fits to squares of either colour hold in those of the other colour."""
+        """Return whether fits to the squares of three of four colours hold in the fourth's."""
         starts, ends = self._starts, self._ends
-        black = (starts // (self._side / SQUARES)).sum(axis=1) % 2 == 1
+        colours = (starts // (self._side / SQUARES)).astype(np.int64) % 2 @ [1, 2]
         predicted = np.empty_like(starts)
-        for used in (black, ~black):
-            found = _fitted(starts[used], ends[used], NOISE_PX)
+        for own in (colours == colour for colour in range(4)):
+            found = _fitted(starts[~own], ends[~own], NOISE_PX)
             if found is None:
                 return False
-            predicted[~used] = transform_points(starts[~used], found)
+            predicted[own] = transform_points(starts[own], found)
         return bool(_misfit(predicted, ends) <= _misfit(starts, ends))
 
     def show_depth(self, foreground: bool = False, seed: int = 0) -> bool:
@@ -195,7 +206,12 @@ def _tracked(views: Pair, matrix: np.ndarray, matches: Pair, free: np.ndarray | 
         equalised, equalise(warped), starts, WINDOW_PX, levels=1, expected=expected
     )
     good = gaps < MAX_ROUND_TRIP_PX
-    return starts[good].astype(np.float64), tracked[good].astype(np.float64)
+    starts, tracked = starts[good], tracked[good]
+    soft0, soft1 = (gaussian_blur(gray.astype(np.float32), BLUR_PX) for gray in (first, warped))
+    unit = np.tile(np.eye(2), (len(starts), 1, 1))
+    aligned = align_patches((soft0, soft1), starts, tracked, unit, ALIGNMENT)
+    rows = aligned.converged
+    return starts[rows].astype(np.float64), aligned.points1[rows]
 
 
 def _scales_at_centre(homography: np.ndarray, size: tuple[int, int]) -> tuple[float, float]:
