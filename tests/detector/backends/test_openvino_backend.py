@@ -8,11 +8,16 @@ pytest.importorskip("openvino")
 INTERRUPTED = """
 import gc, signal
 import numpy as np
+from deepdetect import OptionError
 from deepdetect.detector.backends.interface import RuntimeOptions
 from deepdetect.detector.backends.openvino_backend import open_openvino
 from deepdetect.detector.pretrained import resolve_weights
 path = resolve_weights("default")
 first, second = (open_openvino(path.read_bytes(), RuntimeOptions()) for _ in range(2))
+try:
+    open_openvino(path.read_bytes(), RuntimeOptions(device="tpu"))
+except OptionError:
+    pass
 second.run(["logits"], {"image": np.zeros((1, 3, 32, 32), np.float32)})
 del first
 gc.collect()

@@ -25,6 +25,12 @@ free the thread's signal stack, and the next signal, such as Ctrl-C, would end t
 the same core would then crash."""
 
 
+def _core() -> Any:
+    if not _CORES:
+        _CORES.append(import_openvino().Core())
+    return _CORES[0]
+
+
 class OpenVinoSession:
     """A graph run by OpenVINO.
 
@@ -60,17 +66,17 @@ class OpenVinoSession:
 
 def open_openvino(model: bytes, options: RuntimeOptions) -> OpenVinoSession:
     """Load an ONNX graph; an unsupported precision or a missing device raises an OptionError."""
-    openvino = import_openvino()
+    import_openvino()
     from openvino.frontend import FrontEndManager
 
     device = options.device.upper()
-    available = openvino.Core().available_devices
+    available = _core().available_devices
     if device not in available:
         raise OptionError(
             f"OpenVINO finds no device {options.device} here: use {' or '.join(available).lower()}"
         )
     if options.precision == "bfloat16":
-        known = openvino.Core().get_property(device, "OPTIMIZATION_CAPABILITIES")
+        known = _core().get_property(device, "OPTIMIZATION_CAPABILITIES")
         if "BF16" not in known:
             raise OptionError(
                 "this processor has no instructions for bfloat16: leave `precision` out"
@@ -88,8 +94,6 @@ def open_openvino(model: bytes, options: RuntimeOptions) -> OpenVinoSession:
         # Without the name of the format OpenVINO tries all formats, and prints an error for each.
         reader = FrontEndManager().load_by_framework("onnx")
         graph = reader.convert(reader.load(io.BytesIO(model)))
-        if not _CORES:
-            _CORES.append(openvino.Core())
-        return _CORES[0].compile_model(graph, device, settings)
+        return _core().compile_model(graph, device, settings)
 
     return OpenVinoSession(compile_model)
