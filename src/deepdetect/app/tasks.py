@@ -68,7 +68,7 @@ class Order:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Result of a task: texts by label (`numbers`), the file to show, the files to download."""
+    """Result of a task: its figures as text by label, the file to show, the files to download."""
 
     numbers: Mapping[str, str]
     shown: str

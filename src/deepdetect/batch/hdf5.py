@@ -191,12 +191,13 @@ def fill_file(
     overwrite: bool,
     quiet: bool,
 ) -> BatchReport:
-    """Make the wanted groups that are not in the file yet, in the processes of an engine.
+    """Make the wanted groups that are not in the file yet, in parallel processes of `engine`.
 
     An existing file must have the same `settings`. Shards of an interrupted run with the same
-    settings are used. `wanted` maps each input to the groups that may hold its result, and each of
-    these groups to the state of the input. If the file has none of the groups in this state, the
-    first of them is made. A group that is not wanted, or whose input fails, stays in the file only
+    settings are used. `wanted` has a dictionary for each input: its keys are names of groups that
+    may hold the input's result, its values the state of the input (size, date) that the group must
+    record. If the file has none of these groups with this state, the first one is made. A group
+    that is not wanted, or whose input fails, stays in the file only
     if `others_stay` returns True for the name of the group.
     """
     import_h5py()

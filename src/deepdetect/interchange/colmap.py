@@ -1,4 +1,4 @@
-"""Writing of COLMAP's files: a database, or text files (coordinates and units: `sfm.colmap`)."""
+"""Writing of COLMAP's files: a database, or text files. `sfm.colmap` explains their coordinates."""
 
 from __future__ import annotations
 

@@ -229,7 +229,11 @@ def _can_be_written(values: dict[int, Any]) -> bool:
 
 
 def _append_directory(path: Path, code: int, values: dict[int, Any]) -> None:
-    """Append a directory of EXIF to a TIFF file and turn the tag `code - 1` into its pointer."""
+    """Append a directory of EXIF tags to a TIFF file.
+
+    The file must have a placeholder, the tag `code - 1`. It becomes the tag `code`, which points to
+    the directory.
+    """
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
     from tifffile import TiffFile
 
@@ -385,7 +389,10 @@ def save_picture(
 
 
 def picture_suffix(path: str | Path) -> str:
-    """Return the suffix of an image file in lower case; call it before any expensive work."""
+    """Return the lower-case suffix of an image file; one that cannot be written is an OptionError.
+
+    Calling this before any expensive work lets a wrong suffix fail early.
+    """
     suffix = Path(path).suffix.lower()
     if suffix not in PICTURE_SUFFIXES:
         *names, last = PICTURE_SUFFIXES

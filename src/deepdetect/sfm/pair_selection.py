@@ -26,8 +26,8 @@ def largest_component(pairs: Sequence[Pair]) -> int:
 def motion(first: np.ndarray, second: np.ndarray, matches: np.ndarray) -> float:
     """Return the median motion of matched keypoints in pixels, or infinity if few are matched.
 
-    `first` (N, 2) and `second` (M, 2) are keypoints in pixels, `matches` (K, 2) their indices. Few
-    matches may lie mostly on something fixed to the camera, such as a car's bonnet.
+    `first` (N, 2) and `second` (M, 2) are keypoints in pixels, `matches` (K, 2) their indices. If
+    there are few matches, most may lie on something fixed to the camera, such as a car's bonnet.
     """
     if len(matches) < MIN_MATCHED * min(len(first), len(second)):
         return np.inf

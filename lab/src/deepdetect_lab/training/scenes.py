@@ -94,9 +94,9 @@ FRONT_SHARE, FRONT_COUNTS, OTHER_PHOTOGRAPH_SHARE = 0.5, (1, 1, 2, 3), 0.8
 share `OTHER_PHOTOGRAPH_SHARE` of the parts is from other photographs. Chosen by hand."""
 
 SHAPE_PX, UNCOVERED = 480, (0.6, 0.88)
-"""A foreground part is cut from a photograph where smooth noise (`SHAPE_PX` pixels a side) exceeds
-its quantile at a level drawn from `UNCOVERED`, which leaves 12 to 40 % of the photograph. Chosen by
-hand."""
+"""A foreground part has the pixels of a photograph at which a smooth noise image, `SHAPE_PX` pixels
+a side, exceeds its q-quantile. q is drawn from the range `UNCOVERED`, so a part covers 12 to 40 %
+of the photograph. Chosen by hand."""
 
 FRONT_OFFSET_PX, FRONT_SCALE, FRONT_ANGLE = 60.0, 0.2, 0.3
 """Random pose of a foreground part relative to the scene in the first view: the largest offset per

@@ -94,7 +94,7 @@ class Layer:
 
 
 class Explanation:
-    """The geometries (layers) of a pair of images, the one that explains most first."""
+    """The geometries (layers) of a pair of images, first the one that explains most windows."""
 
     def __init__(
         self,
@@ -435,7 +435,7 @@ def straight_lines(pair: ImagePair, hypothesis: Hypothesis) -> None:
 
 
 def _copies(plane: Layer, other: Layer) -> bool:
-    """Return whether a layer explains no more than another, and mostly cells of the other."""
+    """Return whether half of a plane's cells are also another's that explains no fewer windows."""
     both = plane.evidence.explained & other.evidence.explained
     least = np.count_nonzero(plane.evidence.explained) / 2
     fewer = plane.evidence.windows <= other.evidence.windows

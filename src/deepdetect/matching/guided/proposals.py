@@ -42,9 +42,10 @@ VIEWED_SIDE_PX, VIEWED_KEYPOINTS = 320, 1000
 other, each with half as many points. The 16 views then take as long as DENSE_KEYPOINTS points."""
 
 TENTATIVE_RATIO = 0.95
-"""Limit of the ratio test of learned descriptors for tentative matches. It is loose, because the
-images judge the geometries. On ten pairs with wide baselines or other light (`wide`), limits of
-0.91, 0.93, 0.94, 0.95 and 0.97 give a mAA at 10 px of 0.38, 0.44, 0.36, 0.47 and 0.43."""
+"""Limit of the ratio test of learned descriptors for tentative matches. It is loose, because each
+geometry is later compared with the pixels. On the ten pairs of the data set `wide`, with wide
+baselines or changes of light, limits of 0.91, 0.93, 0.94, 0.95 and 0.97 give an mAA at 10 px of
+0.38, 0.44, 0.36, 0.47 and 0.43."""
 
 SEPARATION_PX = 2.0
 """Only one match per square of this side is kept in each image, in pixels of the reduced images,

@@ -46,7 +46,7 @@ class Photographs:
 
     @cached_property
     def posed(self) -> list[PosedPair]:
-        """Pairs with known cameras. Overlays and frames need images of one size."""
+        """Pairs with known cameras, to which `overlays` and `frames` add what stands still."""
         return [pair for scene in load_posed_scenes(self.data) for pair in scene.pairs]
 
     def any(self, rng: np.random.Generator, size: tuple[int, int] = SIZE) -> np.ndarray:

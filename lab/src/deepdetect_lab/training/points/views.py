@@ -114,7 +114,8 @@ ROTATED_SHARE = 0.2
 """Share of the pairs in which one random rotation is added to both views. Chosen by hand."""
 
 FOCAL_SIDES = (1.2, 3.0)
-"""Range of focal lengths in sides of the view, for fields of 45 to 19 degrees. Chosen by hand."""
+"""Range of focal lengths in units of the view's side: fields of view of 45 to 19 degrees. Chosen by
+hand."""
 
 SHRUNK_SCALE, LEAST_SIDE_PX = 0.9, 8
 """If a view shows the photograph at a scale below `SHRUNK_SCALE`, the photograph is first shrunk to
