@@ -57,7 +57,7 @@ BYTES_PER = {
 """Bytes of memory per item, as measured; `needed_memory` multiplies them by numbers of items."""
 
 # Options of glibc's `mallopt` that keep freed memory: with M_MMAP_MAX = 0 every block is part of
-# the heap, M_TRIM_THRESHOLD = -1 never trims the heap, and M_TOP_PAD lets it grow in steps of 256 MB.
+# the heap, M_TRIM_THRESHOLD = -1 never trims it, and M_TOP_PAD lets it grow in steps of 256 MB.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
 _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD: blocks from 1 MB on are mapped separately
 

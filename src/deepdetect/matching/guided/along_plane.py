@@ -33,7 +33,8 @@ from .judge import Evidence, Judge
 SIDE_PX, MAX_SCALE_RATIO, MIN_SCALE = 1024, 1.5, 1 / 16
 """Images are reduced to a longer side of SIDE_PX. An image that shows the plane over
 MAX_SCALE_RATIO times larger is reduced to the other's scale, but not below MIN_SCALE of its size,
-because corners of different scales lie at different places. Lengths are in pixels of the reduced images."""
+because corners of different scales lie at different places. Lengths are in pixels of the reduced
+images."""
 
 CORNERS, WINDOW_PX, CELL_PX = 1500, 21, 16
 """Maximum number of tracked corners, side of the windows that are tracked around them, and side of
