@@ -224,7 +224,7 @@ def test_a_frame_that_stands_still_is_no_motion(photo: np.ndarray) -> None:
     assert (errors < 1).mean() > 0.95
 
 
-@pytest.mark.parametrize(("number", "seed"), [(14, 0), (32, 0), (16, 2), (16, 3)])
+@pytest.mark.parametrize(("number", "seed"), [(14, 0), (32, 0), (16, 2), (38, 1)])
 def test_a_still_overlay_of_a_scene_that_is_not_found_is_not_trusted_highly(
     shared: Path, number: int, seed: int
 ) -> None:

@@ -375,8 +375,9 @@ class Explanation:
         least = HIGH_SHARE if len(self.layers) == 1 else MOST
         unlike = contradicts(seen)
         if self._stands_still(layer.matches):
-            still = self._seen(own.tentative.cross_modal)[1].along_plane(np.eye(3))
-            unlike |= still.evidence.agreement < NEARLY_ALL  # the still part may be an overlay
+            still = self._seen(own.tentative.cross_modal)[1].along_plane(np.eye(3)).evidence
+            # If some of the image moves, the still part may be an overlay.
+            unlike |= still.agreement < NEARLY_ALL or still.share < NEARLY_ALL * seen.share
         strong = seen.share >= least and own.log10_nfa < HIGH_LOG10_NFA
         before = layer.tracks is not None and layer.tracks.show_depth(True, self._seed)
         return seen.confirms and strong and not (layer.repeated or unlike or before)
