@@ -115,7 +115,7 @@ def compute_maps(
 
 
 @contextmanager
-def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
+def memory_named(shape: tuple[int, ...], images: int = 1) -> Iterator[None]:
     """Convert out-of-memory errors in the block to an error that names the size of the image."""
     try:
         yield
@@ -123,8 +123,9 @@ def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
         if not (isinstance(error, MemoryError) or is_lack_of_memory(error)):
             raise
         raise DeepDetectError(
-            f"there is not enough memory for an image of {shape[1]}x{shape[0]} pixels: "
-            "use `resolution='auto'`, fewer keypoints, or a smaller image"
+            f"there is not enough memory for {'an image' if images == 1 else f'{images} images'} "
+            f"of {shape[1]}x{shape[0]} pixels: use `resolution='auto'`, fewer keypoints, or "
+            f"{'a smaller image' if images == 1 else 'fewer images at once'}"
         ) from None
 
 

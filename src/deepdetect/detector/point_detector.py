@@ -114,22 +114,11 @@ class PointDetector:
                 f"`precision={precision!r}` is not available in PointDetector: leave it out, or "
                 "use a DeepDetect"
             )
-        self._runtime = RuntimeOptions(backend, device, threads)
-        self.backend = backend_name(self._runtime)
-        self._by_graph = (backend, device) != ("auto", "cpu")
-        unusual = {
-            "spread": spread != "none",
-            "ranker": ranker is not None,
-            "max_keypoints": max_keypoints is None,
-        }
-        for name in (name for name, used in unusual.items() if used and self._by_graph):
-            raise OptionError(
-                f"`{name}` as given works only on the CPU: leave `backend` and `device` out, or "
-                f"change `{name}`"
-            )
-        if self._by_graph:
-            open_points(self._runtime)
         self.threads = threads
+        self._runtime = RuntimeOptions(backend, device, threads)
+        name = backend_name(self._runtime)
+        self._by_graph = (backend, device) != ("auto", "cpu")
+        self.runtime = f"{name}, {device}" if self._by_graph else "compiled"
         check_name("spread", spread, SPREADS)
         if spread != "none" and max_keypoints is None:
             raise OptionError(f"`spread={spread!r}` needs `max_keypoints`, the number to spread")
@@ -138,6 +127,18 @@ class PointDetector:
         self.spread, self.upright, self.resolution = spread, bool(upright), resolution
         self.min_logit = min_logit
         check_ranges(self, between={"min_logit": (-1000, 1000)})
+        unusual = {
+            "spread": spread != "none",
+            "ranker": ranker is not None,
+            "max_keypoints": max_keypoints is None,
+        }
+        for name in (name for name, used in unusual.items() if used and self._by_graph):
+            raise OptionError(
+                f"`{name}` as given works only without `backend` and `device`: leave these out, or "
+                f"change `{name}`"
+            )
+        if self._by_graph:
+            open_points(self._runtime)
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         self._ranker = load_ranker(self.ranker)
         if isinstance(descriptor, Descriptor):
@@ -155,6 +156,7 @@ class PointDetector:
         """All that determines the keypoints of an image: options and the digest of the ranker."""
         return {
             "detector": "points",
+            "runtime": self.runtime,
             "ranker": file_digest(self.ranker),
             "max_keypoints": self.max_keypoints,
             "spread": self.spread,
@@ -214,7 +216,14 @@ class PointDetector:
             ImageError: an image cannot be read or is unsuitable.
             OptionError: a mask has another size than its image.
         """
-        return self._detected(found_in_each(images, channels, ignore, self._seen), max_keypoints)
+        if self._by_graph:
+            seen = found_in_each(images, channels, ignore, self._seen)
+            return self._detected(seen, max_keypoints)
+
+        def detected(rgb: np.ndarray, mask: np.ndarray | None) -> Keypoints:
+            return self._detected([self._seen(rgb, mask)], max_keypoints)[0]
+
+        return found_in_each(images, channels, ignore, detected)
 
     @suggest_keywords
     def extract(
@@ -239,8 +248,7 @@ class PointDetector:
             OptionError: the mask has another size than the image.
             WeightsError: the ONNX file of the descriptor is damaged.
         """
-        images = [load_pixels(image, channels)]
-        return self.extract_batch(images, max_keypoints=max_keypoints, ignore=[ignore])[0]
+        return self._extracted(load_pixels(image, channels), ignore, max_keypoints)
 
     @suggest_keywords
     def extract_batch(
@@ -253,8 +261,8 @@ class PointDetector:
     ) -> list[Keypoints]:
         """Detect the best keypoints of several images, and describe them.
 
-        A backend of ONNX runs all images of one size at once, which is faster on a graphics card,
-        and takes memory in proportion to their number.
+        With `backend` or `device`, learned descriptors and points of all images of one size are
+        computed at once, which is faster on a graphics card, and takes memory for all of them.
 
         Args:
             images, max_keypoints, ignore, channels: see `detect_batch`.
@@ -267,14 +275,14 @@ class PointDetector:
             OptionError: a mask has another size than its image.
             WeightsError: the ONNX file of the descriptor is damaged.
         """
-        if isinstance(self.descriptor, Descriptor) or self.descriptor_type == ROOT_SIFT:
-
-            def described(rgb: np.ndarray, mask: np.ndarray | None) -> Keypoints:
-                return self.describe(rgb, self._detected([self._seen(rgb, mask)], max_keypoints)[0])
-
-            return found_in_each(images, channels, ignore, described)
-        seen = found_in_each(images, channels, ignore, self._seen)
-        return self._described([each.gray for each in seen], self._detected(seen, max_keypoints))
+        if self._by_graph and self._is_network:
+            seen = found_in_each(images, channels, ignore, self._seen)
+            return self._described(
+                [each.gray for each in seen], self._detected(seen, max_keypoints)
+            )
+        return found_in_each(
+            images, channels, ignore, lambda rgb, mask: self._extracted(rgb, mask, max_keypoints)
+        )
 
     @suggest_keywords
     def describe(
@@ -305,8 +313,22 @@ class PointDetector:
         return (
             f"PointDetector(max_keypoints={self.max_keypoints}, spread={self.spread!r}, "
             f"upright={self.upright}, resolution={self.resolution!r}, ranker={self.ranker.name}, "
-            f"descriptor={str(self.descriptor)!r})"
+            f"descriptor={str(self.descriptor)!r}, runtime={self.runtime!r})"
         )
+
+    @property
+    def _is_network(self) -> bool:
+        """Whether descriptors are computed by a network from the luma."""
+        return not isinstance(self.descriptor, Descriptor) and self.descriptor_type != ROOT_SIFT
+
+    def _extracted(
+        self, rgb: np.ndarray, ignore: np.ndarray | None, max_keypoints: int | None
+    ) -> Keypoints:
+        seen = self._seen(rgb, ignore)
+        found = self._detected([seen], max_keypoints)[0]
+        if self._is_network:
+            return self._described([seen.gray], [found])[0]
+        return self.describe(rgb, found)
 
     def _seen(self, rgb: np.ndarray, ignore: np.ndarray | None) -> _Seen:
         rgb, ignore = load_visible(rgb, ignore=ignore)
@@ -362,12 +384,14 @@ class PointDetector:
     ) -> list[Keypoints]:
         """Call `run` once for the images of each size or, without a graph, once for each image."""
         groups: dict[Any, list[int]] = {}
-        for k, gray in enumerate(grays):
-            groups.setdefault(gray.shape if self._by_graph else k, []).append(k)
+        for k, (gray, other) in enumerate(zip(grays, others, strict=True)):
+            # A mask changes the number of keypoints for which the graph runs.
+            key = (gray.shape, isinstance(other, np.ndarray)) if self._by_graph else k
+            groups.setdefault(key, []).append(k)
         results: dict[int, Keypoints] = {}
         for rows in groups.values():
             some = [grays[k] for k in rows]
-            with memory_named(some[0].shape), limited_threads(self.threads):
+            with memory_named(some[0].shape, len(some)), limited_threads(self.threads):
                 found = run(some, [others[k] for k in rows])
             results |= zip(rows, found, strict=True)
         return [results[k] for k in range(len(grays))]

@@ -332,6 +332,17 @@ def match_descriptors(
         rows, distances = matcher(descriptors0, descriptors1, 2, seed, positions)
         back = None if positions is None else positions[::-1]
         nearest = matcher(descriptors1, descriptors0, 1, seed, back)[0][:, 0] if mutual else rows
+    return kept_matches(rows, distances, nearest, ratio, mutual)
+
+
+def kept_matches(
+    rows: np.ndarray, distances: np.ndarray, nearest: np.ndarray, ratio: float, mutual: bool
+) -> DescriptorMatches:
+    """Return the matches that pass the ratio test and, if `mutual`, are nearest both ways.
+
+    `rows` and `distances` are the two nearest `Neighbours` of each descriptor of the first set.
+    `nearest` has the row of the first set that is nearest to each descriptor of the second set.
+    """
     best, second = distances[:, 0], distances[:, 1]
     # If both neighbours are at distance 0, they are equally good, and the ratio is 1.
     ratios = np.divide(best, second, out=np.ones_like(best), where=second > 0)

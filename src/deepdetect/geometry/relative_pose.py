@@ -201,7 +201,7 @@ def estimate_relative_pose(
     for _ in range(MAX_REFITS):
         before = np.count_nonzero(kept)
         inliers = points0[kept], points1[kept]
-        known = None if covariances is None else covariances[kept]
+        known = None if covariances is None else np.asarray(covariances)[kept]
         pose = refine_pose(*inliers, calibration, *pose, inlier_threshold, known)
         errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
         kept = errors < inlier_threshold
@@ -227,17 +227,19 @@ def refine_pose(
 
     A Cauchy loss is minimised over five angles: three of the rotation and two of the direction of
     the translation. The loss never rises above that of the initial pose. A match with a Sampson
-    distance of `scale_px` / 2, or of twice its standard deviation if `covariances` of `points1` are
-    given, has half the weight of an exact match.
+    distance of `scale_px` / 2 has half the weight of an exact match. If `covariances` of `points1`
+    are given, twice the standard deviation of this distance takes the place of `scale_px` / 2.
     """
     points0, points1 = _evenly(points0), _evenly(points1)
     pose = rotation, translation / np.linalg.norm(translation)
     sigmas = np.full(len(points0), scale_px / 4)
     if covariances is not None:
-        lines = np.column_stack([points0, np.ones(len(points0))])
-        lines = (lines @ fundamental_matrix(calibration, *pose).T)[:, :2]
-        across = np.einsum("ni,nij,nj->n", lines, _evenly(covariances), lines)
-        sigmas = np.sqrt(across / (lines**2).sum(axis=1).clip(np.finfo(float).tiny)) + MIN_SIGMA_PX
+        fundamental, ones = fundamental_matrix(calibration, *pose), np.ones((len(points0), 1))
+        lines1 = (np.hstack([points0, ones]) @ fundamental.T)[:, :2]
+        lines0 = (np.hstack([points1, ones]) @ fundamental)[:, :2]
+        across = np.einsum("ni,nij,nj->n", lines1, _evenly(covariances), lines1)
+        gradient = (lines1**2 + lines0**2).sum(axis=1)  # of the Sampson distance
+        sigmas = np.sqrt(across / gradient.clip(np.finfo(float).tiny)) + MIN_SIGMA_PX
     return fit_to_lines(
         pose,
         points0,

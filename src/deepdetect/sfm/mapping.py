@@ -143,8 +143,10 @@ def map_images(
 ) -> tuple[Any, list[frozenset[str]]]:
     """Estimate the poses of connected images one after the other, from verified pairs.
 
-    With `known_cameras`, all intrinsics stay fixed. `registered` gets the number of images just
-    added. Returns the largest `pycolmap.Reconstruction`, and the image names of each other model.
+    With `known_cameras`, all intrinsics stay fixed; without, they do so in a last attempt, if two
+    images alone gave intrinsics that fit no third image. `registered` gets the number of images
+    just added. Returns the largest `pycolmap.Reconstruction`, and the image names of each other
+    model.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()

@@ -53,3 +53,16 @@ def test_the_package_computes_logits_only(tmp_path: Path) -> None:
     network, _ = open_network(path, RuntimeOptions())
     image = np.random.default_rng(0).random((2, 3, 40, 56), np.float32)
     np.testing.assert_allclose(network(image), run(MODEL, image=image)[1], atol=1e-4)
+
+
+def test_weights_in_a_file_of_their_own(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+    from deepdetect.detector.backends import RuntimeOptions, open_network
+
+    path = tmp_path / "network.onnx"
+    model = onnx.load_from_string(MODEL)
+    onnx.save(model, path, save_as_external_data=True, size_threshold=100)
+    assert (tmp_path / "network.onnx").stat().st_size < len(MODEL) / 2
+    image = np.random.default_rng(0).random((1, 3, 40, 56), np.float32)
+    network, _ = open_network(path, RuntimeOptions())
+    np.testing.assert_allclose(network(image), run(MODEL, image=image)[1], atol=1e-4)

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, WeightsError, first_line
+from ..._shared.errors import DeepDetectError, OptionError, WeightsError, first_line
 from ..._shared.options import suggest_keywords
 from ..pretrained import LOGITS, PADDED_LOGITS
 
@@ -55,6 +55,21 @@ class Session(Protocol):
         """Release the memory kept between runs; `smallest` are inputs that need little memory."""
 
 
+def run_graph(
+    session: Session, outputs: Sequence[str], given: Mapping[str, np.ndarray], what: str
+) -> list[np.ndarray]:
+    """Compute outputs; a failure names `what` failed, or is a MemoryError if memory was short."""
+    try:
+        return session.run(outputs, given)
+    except Exception as error:  # the runtimes' exceptions share no base class
+        session.reload()
+        if any(word in f"{type(error).__name__} {error}" for word in ("MemoryError", "alloc")):
+            raise MemoryError(str(error)) from None
+        raise DeepDetectError(
+            f"the network failed on {what} ({_reason(error)}): use another backend or device"
+        ) from None
+
+
 class OnnxNetwork:
     """A network in a session. `onnx_path` is None if the network cannot run in tiles."""
 
@@ -68,14 +83,13 @@ class OnnxNetwork:
         self._works = False  # whether a run has given a correct result
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        try:
-            output = self._session.run([self._output], {self._input: image})[0]
-            # If memory is short, OpenVINO may return an empty map or that of the previous image.
-            if self._works and output.shape[2:] != image.shape[2:]:
-                raise MemoryError("the runtime gave a map of another size than the image")
-        except Exception as error:  # the runtimes' exceptions share no base class
+        height, width = image.shape[2:]
+        what = f"an image of {width}x{height} pixels"
+        (output,) = run_graph(self._session, [self._output], {self._input: image}, what)
+        # If memory is short, OpenVINO may return an empty map or that of the previous image.
+        if self._works and output.shape[2:] != image.shape[2:]:
             self._session.reload()
-            raise failed_run(error, image.shape) from None
+            raise MemoryError("the runtime gave a map of another size than the image")
         logits = as_logits(output, self._output, image.shape, self._path)
         self._works = True
         return logits
@@ -122,14 +136,11 @@ def unreadable(path: Path, error: Exception) -> WeightsError:
     )
 
 
-def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
-    """Return the error for a failed run on images of a shape: a MemoryError if memory was short."""
-    if any(word in f"{type(error).__name__} {error}" for word in ("MemoryError", "alloc")):
-        return MemoryError(str(error))
-    height, width = image_shape[2:]
-    return DeepDetectError(
-        f"the network failed on an image of {width}x{height} pixels ({_reason(error)}): "
-        "use another backend or device"
+def not_started(device: str, reason: object) -> OptionError:
+    """Return the error for a device that a runtime knows but cannot start."""
+    return OptionError(
+        f"the device {device} could not start ({first_line(reason)}): check its driver "
+        "and libraries, or leave `device` out"
     )
 
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import OptionError, first_line, unknown_name
-from ..._shared.runtimes import CPU, import_onnxruntime, start_session
-from .interface import RuntimeOptions
+from ..._shared.errors import OptionError, unknown_name
+from ..._shared.runtimes import CPU, CUDA, import_onnxruntime, start_session
+from .interface import RuntimeOptions, not_started
 
-PROVIDERS = {"cpu": CPU, "cuda": "CUDAExecutionProvider"}
+PROVIDERS = {"cpu": CPU, "cuda": CUDA}
 
 
 class OnnxRuntimeSession:
@@ -40,8 +40,8 @@ class OnnxRuntimeSession:
             self._session.run(self.outputs, {**smallest}, settings)
 
 
-def open_onnxruntime(model: bytes, options: RuntimeOptions) -> OnnxRuntimeSession:
-    """Load an ONNX graph; a device that is not available raises an OptionError."""
+def open_onnxruntime(model: bytes | str, options: RuntimeOptions) -> OnnxRuntimeSession:
+    """Load an ONNX graph or the file of one; a missing device raises an OptionError."""
     onnxruntime = import_onnxruntime()
     device = options.device
     provider = PROVIDERS.get(device, device)
@@ -59,15 +59,8 @@ def open_onnxruntime(model: bytes, options: RuntimeOptions) -> OnnxRuntimeSessio
     except Exception as error:  # ONNX Runtime's exceptions share no base class
         if provider == CPU:
             raise
-        raise _not_started(device, error) from None
+        raise not_started(device, error) from None
     # If a provider cannot start, ONNX Runtime silently continues on the CPU.
     if provider not in session.get_providers():
-        raise _not_started(device, "no reason given")
+        raise not_started(device, "no reason given")
     return OnnxRuntimeSession(session)
-
-
-def _not_started(device: str, reason: object) -> OptionError:
-    return OptionError(
-        f"the device {device} could not start ({first_line(reason)}): check its driver "
-        "and libraries, or leave `device` out"
-    )

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 from ..._shared.runtimes import import_openvino
-from .interface import RuntimeOptions
+from .interface import RuntimeOptions, not_started
 
 COMPILED_LAYERS = 100
 """OpenVINO compiles layers for each image size, and caches at most this many. OpenVINO's default of
@@ -46,9 +46,10 @@ class OpenVinoSession:
 
     def run(self, outputs: Sequence[str], given: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         """Compute outputs."""
-        if self._model is None:
-            self._model = self._compile()
-        request = self._model.create_infer_request()  # one per call, for concurrent threads
+        model = self._model  # another thread may call `reload`
+        if model is None:
+            model = self._model = self._compile()
+        request = model.create_infer_request()  # one per call, for concurrent threads
         found = request.infer({**given}, share_inputs=True)
         return [found[name] for name in outputs]
 
@@ -64,14 +65,17 @@ class OpenVinoSession:
             self._model.release_memory()
 
 
-def open_openvino(model: bytes, options: RuntimeOptions) -> OpenVinoSession:
-    """Load an ONNX graph; an unsupported precision or a missing device raises an OptionError."""
+def open_openvino(model: bytes | str, options: RuntimeOptions) -> OpenVinoSession:
+    """Load an ONNX graph or the file of one.
+
+    A missing device or an unsupported precision raises an OptionError.
+    """
     import_openvino()
     from openvino.frontend import FrontEndManager
 
     device = options.device.upper()
     available = _core().available_devices
-    if device not in available:
+    if not any(each == device or each.startswith(f"{device}.") for each in available):
         raise OptionError(
             f"OpenVINO finds no device {options.device} here: use {' or '.join(available).lower()}"
         )
@@ -93,7 +97,12 @@ def open_openvino(model: bytes, options: RuntimeOptions) -> OpenVinoSession:
     def compile_model() -> Any:
         # Without the name of the format OpenVINO tries all formats, and prints an error for each.
         reader = FrontEndManager().load_by_framework("onnx")
-        graph = reader.convert(reader.load(io.BytesIO(model)))
-        return _core().compile_model(graph, device, settings)
+        graph = reader.convert(reader.load(model if isinstance(model, str) else io.BytesIO(model)))
+        try:
+            return _core().compile_model(graph, device, settings)
+        except Exception as error:  # OpenVINO's exceptions share no base class
+            if device == "CPU":
+                raise
+            raise not_started(options.device, error) from None
 
     return OpenVinoSession(compile_model)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..._shared.errors import (
     check_name,
     require_packages,
 )
+from ..._shared.machine import thread_limit
 from ..._shared.options import check_ranges
 from ..pretrained import LOGITS, PADDED_IMAGE, PADDED_LOGITS
 from .interface import PROBE_SHAPE, Network, OnnxNetwork, RuntimeOptions, Session, unreadable
@@ -27,7 +29,7 @@ from .onnx_parts import cut_onnx
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
 
-BACKENDS: dict[str, Callable[[bytes, RuntimeOptions], Session]] = {
+BACKENDS: dict[str, Callable[[bytes | str, RuntimeOptions], Session]] = {
     "onnxruntime": open_onnxruntime,
     "openvino": open_openvino,
 }
@@ -73,6 +75,7 @@ def open_graph(path: Path, options: RuntimeOptions, *parts: Ends) -> Session:
 
     Parts are given by their inputs and outputs (see `cut_onnx`). Sessions are cached.
     """
+    options = replace(options, threads=options.threads or thread_limit())
     return _graph(path, options, parts, _state(path))
 
 
@@ -89,18 +92,15 @@ def _graph(
     name = backend_name(options)
     require_packages(f"reading {path.name} with the backend {name}", name)
     model = path.read_bytes()
-    try:
-        for inputs, outputs in parts:
-            try:
-                model = cut_onnx(model, inputs, outputs)
-                break
-            except KeyError:
-                continue
-        return BACKENDS[name](model, options)
-    except DeepDetectError:
-        raise
-    except Exception as error:  # Protobuf's and the runtimes' exceptions share no base class
-        raise unreadable(path, error) from None
+    for part in (*parts, None):
+        try:
+            return BACKENDS[name](cut_onnx(model, *part) if part else str(path), options)
+        except DeepDetectError:
+            raise
+        except Exception as error:  # Protobuf's and the runtimes' exceptions share no base class
+            if part is None:
+                raise unreadable(path, error) from None
+    raise AssertionError("the last part is the whole file")
 
 
 @functools.lru_cache(maxsize=4)

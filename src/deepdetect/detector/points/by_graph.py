@@ -10,7 +10,7 @@ import numpy as np
 from ...features.keypoints import Keypoints
 from ...io.image import at_pixels
 from ..backends import RuntimeOptions, open_graph
-from ..backends.interface import Session, failed_run
+from ..backends.interface import Session, run_graph
 from ..pretrained import GRAY, MAX_KEYPOINTS, POINTS, POINTS_GRAPH
 from .detection import ranking_logits
 
@@ -29,19 +29,18 @@ def detect_by_graph(
 ) -> list[Keypoints]:
     """Detect keypoints of all scales in (H, W) uint8 images of one size, in one run.
 
-    The keypoints are those of `detect_points`, up to rounding. `ignore` has a mask for each image.
-    If too few keypoints are outside, the graph runs again for twice as many.
+    Without masks, the keypoints are those of `detect_points`, up to rounding. `ignore` has a mask
+    or None for each image. As the graph does not know masks, it finds more keypoints, until enough
+    are outside. Some of them are others than those of `detect_points`.
     """
     session = open_points(runtime)
     images = np.stack(grays)[:, None].astype(np.float32)
+    height, width = grays[0].shape
     visible = min(1.0 if mask is None else 1 - np.mean(mask != 0) for mask in ignore)
     count, short = math.ceil(max_keypoints / max(visible, 1 / 8)), True
     while short:
-        try:
-            found = session.run(POINTS, {GRAY: images, MAX_KEYPOINTS: np.array([count])})
-        except Exception as error:  # the runtimes' exceptions share no base class
-            session.reload()
-            raise failed_run(error, images.shape) from None
+        inputs = {GRAY: images, MAX_KEYPOINTS: np.array([count])}
+        found = run_graph(session, POINTS, inputs, f"{width}x{height} pixels")
         xys, scores = found[:2]
         wanted = [each > 0 for each in scores]
         full = [each.all() for each in wanted]
@@ -61,7 +60,7 @@ def detect_by_graph(
             Keypoints(
                 xy[rows],
                 score[rows],
-                grays[0].shape[::-1],
+                (width, height),
                 logits=logits[rows],
                 sizes=size[rows],
                 angles=angle[rows],

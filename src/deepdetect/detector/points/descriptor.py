@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from ..._shared.errors import OptionError, WeightsError
-from ..._shared.machine import thread_limit
 from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
 from ...features.keypoints import Keypoints
@@ -24,7 +23,7 @@ from ...features.scale_space import set_angles
 from ...features.sift import ROOT_SIFT
 from ...geometry.images import edge_strength
 from ..backends import RuntimeOptions, open_graph
-from ..backends.interface import Session, failed_run
+from ..backends.interface import Session, run_graph
 from ..pretrained import RANKER, resolve_weights
 
 DESCRIPTOR_GRAPHS = {
@@ -92,11 +91,8 @@ def describe_batch(
     if most:
         luma /= 255
         session = _open(DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor)), runtime)
-        try:
-            (upright,) = session.run(["descriptors"], {"luma": luma, "xy": xy, "sizes": sizes})
-        except Exception as error:  # the runtimes' exceptions share no base class
-            session.reload()
-            raise failed_run(error, luma.shape) from None
+        inputs = {"luma": luma, "xy": xy, "sizes": sizes}
+        (upright,) = run_graph(session, ["descriptors"], inputs, f"{width}x{height} pixels")
     return [
         replace(
             points,
@@ -122,7 +118,7 @@ def descriptor_type(descriptor: str | Path) -> str:
 
 def _open(path: Path, runtime: RuntimeOptions) -> Session:
     """Load a file; one that does not describe keypoints raises a WeightsError."""
-    session = open_graph(path, replace(runtime, threads=thread_limit()))
+    session = open_graph(path, runtime)
     names = {*session.inputs}, {*session.outputs}
     if names != ({"luma", "xy", "sizes"}, {"descriptors"}):
         raise WeightsError(

@@ -2,8 +2,8 @@
 
 The second image is warped by the homography of a plane. Corners and tentative matches are tracked
 from the first image to the warped one. A homography is fitted to the largest set of tracks on one
-plane. It is kept if homographies fitted to the black and to the white squares of a chessboard have,
-each in the squares of the other colour, no larger errors than the initial homography.
+plane. It is kept if, in squares of four alternating colours, homographies fitted to three colours
+have no larger errors in the fourth colour than the initial homography.
 
 In a static scene, parallax displaces points off the plane along lines through the epipole (Chum,
 Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane", 2005). Lens
@@ -41,8 +41,8 @@ CORNERS, WINDOW_PX, CELL_PX = 1500, 21, 16
 the squares that each give one track to measure parallax. Chosen by hand."""
 
 MIN_TRACKS, SQUARES = 15, 8
-"""A geometry is fitted to at least MIN_TRACKS tracks. The chessboard by which a homography is
-validated has SQUARES squares along the longer side of the image. Chosen by hand."""
+"""A geometry is fitted to at least MIN_TRACKS tracks. To validate a homography, the image is
+divided into squares, SQUARES along its longer side, of four colours. Chosen by hand."""
 
 MAX_PARALLAX = 0.1
 """A tentative match is not tracked if it ends farther than this fraction of the longer side from
