@@ -104,30 +104,19 @@ class PlaneTracks:
         self._side = max(first.shape)
         matrix = self._matrix = scaled_homography(homography, scale0, scale1)
         ends = scaled_points(matches[0], scale0), scaled_points(matches[1], scale1)
-        self._starts, self._ends = _tracked((first, second), matrix, ends, free)
+        self._starts, self._ends, aligned = _tracked((first, second), matrix, ends, free)
+        exact = self._starts[aligned], self._ends[aligned]
         moved = transform_points(self._ends, matrix)
         self.points = scaled_points(self._starts, 1 / scale0), scaled_points(moved, 1 / scale1)
         self.homography = homography
-        correction = _fitted(self._starts, self._ends, NOISE_PX)
-        if correction is not None and self._validated():
+        correction = _fitted(*exact, NOISE_PX)
+        if correction is not None and _validated(*exact, self._side / SQUARES):
             refined = scaled_homography(matrix @ correction, 1 / scale0, 1 / scale1)
             self.homography = refined / refined[2, 2]
         # Parallax is measured from the plane on which most tracks lie within NOISE_PX / 2.
-        sharp = _fitted(self._starts, self._ends, NOISE_PX / 2)
+        sharp = _fitted(*exact, NOISE_PX / 2)
         if sharp is not None:
             self._ends = transform_points(self._ends, np.linalg.inv(sharp))
-
-    def _validated(self) -> bool:
-        """Return whether fits to the squares of three of four colours hold in the fourth's."""
-        starts, ends = self._starts, self._ends
-        colours = (starts // (self._side / SQUARES)).astype(np.int64) % 2 @ [1, 2]
-        predicted = np.empty_like(starts)
-        for own in (colours == colour for colour in range(4)):
-            found = _fitted(starts[~own], ends[~own], NOISE_PX)
-            if found is None:
-                return False
-            predicted[own] = transform_points(starts[own], found)
-        return bool(_misfit(predicted, ends) <= _misfit(starts, ends))
 
     def show_depth(self, foreground: bool = False, seed: int = 0) -> bool:
         """Return whether the scene has depth or, if `foreground`, an object far from its plane."""
@@ -167,6 +156,18 @@ def match_along_plane(
     return GuidedMatches(indices0, ends, scores.clip(0, 1), indices1=indices1)
 
 
+def _validated(starts: np.ndarray, ends: np.ndarray, side_px: float) -> bool:
+    """Return whether fits to the squares of three of four colours hold in the fourth's."""
+    colours = (starts // side_px).astype(np.int64) % 2 @ [1, 2]
+    predicted = np.empty_like(starts)
+    for own in (colours == colour for colour in range(4)):
+        found = _fitted(starts[~own], ends[~own], NOISE_PX)
+        if found is None:
+            return False
+        predicted[own] = transform_points(starts[own], found)
+    return _misfit(predicted, ends) <= _misfit(starts, ends)
+
+
 def _misfit(expected: np.ndarray, ends: np.ndarray) -> float:
     """Return the mean squared error of (N, 2) tracks, of which each counts at most `NOISE_PX`."""
     return float(np.minimum(((ends - expected) ** 2).sum(axis=1), NOISE_PX**2).mean())
@@ -184,8 +185,14 @@ def _fitted(starts: np.ndarray, ends: np.ndarray, threshold_px: float) -> np.nda
     return cv2.findHomography(starts[near], ends[near])[0] if near.sum() >= MIN_TRACKS else None
 
 
-def _tracked(views: Pair, matrix: np.ndarray, matches: Pair, free: np.ndarray | None) -> Pair:
-    """Track corners and matches; return (N, 2) starts and ends in the frame of the first image."""
+def _tracked(
+    views: Pair, matrix: np.ndarray, matches: Pair, free: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Track corners and matches.
+
+    Returns (N, 2) starts and ends in the frame of the first image, and which ends were refined by
+    an alignment, (N,) bool.
+    """
     first, second = views
     warped, valid = warp_to_reference(second, matrix, first.shape[::-1], exact=True)
     inside = cv2.erode(valid.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX)), borderValue=0)
@@ -202,7 +209,7 @@ def _tracked(views: Pair, matrix: np.ndarray, matches: Pair, free: np.ndarray | 
         for both in ((starts, matches[0][near]), (starts, ends[near]))
     )
     if not len(starts):
-        return np.empty((0, 2)), np.empty((0, 2))
+        return np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool)
     tracked, gaps = track_round_trip(
         equalised, equalise(warped), starts, WINDOW_PX, levels=1, expected=expected
     )
@@ -211,8 +218,7 @@ def _tracked(views: Pair, matrix: np.ndarray, matches: Pair, free: np.ndarray | 
     soft0, soft1 = (gaussian_blur(gray.astype(np.float32), BLUR_PX) for gray in (first, warped))
     unit = np.tile(np.eye(2), (len(starts), 1, 1))
     aligned = align_patches((soft0, soft1), starts, tracked, unit, ALIGNMENT)
-    rows = aligned.converged
-    return starts[rows].astype(np.float64), aligned.points1[rows]
+    return starts.astype(np.float64), aligned.points1, aligned.converged
 
 
 def _scales_at_centre(homography: np.ndarray, size: tuple[int, int]) -> tuple[float, float]:
