@@ -46,7 +46,7 @@ divided into squares, SQUARES along its longer side, of four colours. Chosen by 
 
 MAX_PARALLAX = 0.15
 """A tentative match is not tracked if it ends farther than this fraction of the longer side from
-where the homography maps it: the views differ too much there. With 0.1, too few points of a post
+where the homography maps it: the views differ too much there. With 0.1, not enough points of a post
 that covers 7 % of a synthetic view are tracked to show that it stands before the wall."""
 
 ALIGNMENT, BLUR_PX = Alignment(radius_px=7, max_shift_px=2.0, convergence_px=0.02, cubic=False), 0.8
