@@ -309,17 +309,13 @@ def _cameras(options: GeometryOptions) -> tuple[np.ndarray, np.ndarray]:
 
 
 def log10_nfa(
-    inliers: np.ndarray,
-    model: str,
-    inlier_threshold: float,
-    image_size: tuple[int, int],
-    models_per_sample: int = 1,
+    inliers: np.ndarray, model: str, inlier_threshold: float, image_size: tuple[int, int]
 ) -> float:
     """Return the decimal logarithm of the number of false alarms (NFA) of a model.
 
     `inliers` is (M,) bool: the matches with an error below `inlier_threshold`, in pixels.
-    `image_size` is (width, height) of the second image. For each minimal sample,
-    `models_per_sample` models were tried. The result is infinite if there are too few inliers.
+    `image_size` is (width, height) of the second image. The result is infinite if there are too few
+    inliers.
     """
     width, height = image_size
     if model == "homography":
@@ -327,8 +323,7 @@ def log10_nfa(
     else:  # area of a band along an epipolar line, relative to that of the image
         chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
     agreeing = int(np.count_nonzero(inliers))
-    sample_size = MINIMAL_SAMPLE_SIZE[model]
-    return _log10_nfa(len(inliers), agreeing, sample_size, chance, models_per_sample)
+    return _log10_nfa(len(inliers), agreeing, MINIMAL_SAMPLE_SIZE[model], chance)
 
 
 def log10_nfa_nearby(errors: np.ndarray, model: str, inlier_threshold: float) -> float:
@@ -346,15 +341,13 @@ def log10_nfa_nearby(errors: np.ndarray, model: str, inlier_threshold: float) ->
     return _log10_nfa(count, agreeing, MINIMAL_SAMPLE_SIZE[model], 1 / NEARBY_AREA)
 
 
-def _log10_nfa(
-    count: int, agreeing: int, sample_size: int, chance: float, models_per_sample: int = 1
-) -> float:
+def _log10_nfa(count: int, agreeing: int, sample_size: int, chance: float) -> float:
     def log_binomial(count: int, chosen: int) -> float:
         return lgamma(count + 1) - lgamma(chosen + 1) - lgamma(count - chosen + 1)
 
     if agreeing <= sample_size:
         return inf
-    tests = log(models_per_sample * (count - sample_size))
+    tests = log(count - sample_size)
     tests += log_binomial(count, agreeing) + log_binomial(agreeing, sample_size)
     return (tests + (agreeing - sample_size) * log(min(chance, 1.0))) / log(10)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -114,13 +113,12 @@ def local_zncc(
     valid_mask: np.ndarray,
     window_px: int = WINDOW_PX,
     step_px: int = 1,
-    min_variance: float = MIN_VARIANCE,
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation (ZNCC) of windows at the same positions.
 
     A window of side `window_px`, an odd multiple of `step_px`, is centred on each square of side
     `step_px`. Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for windows that
-    are flat (up to `min_variance`) or partly outside `valid_mask`.
+    are flat (up to `MIN_VARIANCE`) or partly outside `valid_mask`.
     """
     side = window_px // step_px
     shape = (first.shape[0] // step_px, first.shape[1] // step_px)
@@ -143,7 +141,7 @@ def local_zncc(
     variance_a = mean(a * a) - mean_a**2
     variance_b = mean(b * b) - mean_b**2
     inside = _erode(at_steps(mask.astype(np.float32)) > 1 - 0.5 / step_px**2, side)
-    known = inside & (variance_a > min_variance) & (variance_b > min_variance)
+    known = inside & (variance_a > MIN_VARIANCE) & (variance_b > MIN_VARIANCE)
     covariance = mean(a * b) - mean_a * mean_b
     result = np.full(shape, np.nan, np.float32)
     scale = np.sqrt(variance_a[known] * variance_b[known])
@@ -187,31 +185,19 @@ def window_sums(
     window_px: int,
     *,
     at: np.ndarray | None = None,
-    dtype: type[np.floating[Any]] | None = None,
 ) -> np.ndarray:
     """Sum the values of sparse pixels over square windows, one sum for each window, (M,).
 
     `pixels` are (N, 2) int64 (x, y), all different. `values` has one value for each pixel, or is
     one value for all. The image has the shape `shape`, (H, W, ...). The windows are centred at the
-    (M, 2) pixels `at`, by default at `pixels`. The sums have the type of the values, or `dtype`.
+    (M, 2) pixels `at`, by default at `pixels`. The sums have the type of the values.
     """
-    image = _scatter(pixels, values, shape, dtype)
+    image = np.zeros(tuple(shape[:2]), np.asarray(values).dtype)
+    image[pixels[:, 1], pixels[:, 0]] = values
     window = (window_px, window_px)
     sums = cv2.boxFilter(image, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
     x, y = (pixels if at is None else at).T
     return sums[y, x]
-
-
-def _scatter(
-    pixels: np.ndarray,
-    values: np.ndarray | np.generic | float,
-    shape: Sequence[int],
-    dtype: type[np.floating[Any]] | None,
-) -> np.ndarray:
-    """Return an (H, W) image with the values at their pixels, and 0 elsewhere."""
-    image = np.zeros(tuple(shape[:2]), dtype or np.asarray(values).dtype)
-    image[pixels[:, 1], pixels[:, 0]] = values
-    return image
 
 
 MAX_ROUND_TRIP_PX = 0.3
