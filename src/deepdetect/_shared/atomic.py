@@ -57,6 +57,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             temporary.unlink()
 
 
+def write_whole(path: str | Path, content: str | bytes) -> None:
+    """Write bytes, or text in UTF-8, to a file as `atomic_path` does."""
+    with atomic_path(path) as temporary:
+        if isinstance(content, str):
+            temporary.write_text(content, encoding="utf-8")
+        else:
+            temporary.write_bytes(content)
+
+
 def private_folder(prefix: str) -> Path:
     """Make a temporary folder that only this user can read; the caller removes it.
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .atomic import atomic_path
+from .atomic import atomic_path, write_whole
 from .errors import DeepDetectError, MissingFileError, OptionError
 
 FOLDER = ".deepdetect"
@@ -182,7 +182,7 @@ class Outputs:
                         if content is None:
                             record.unlink()
                         else:
-                            _write(record, content)
+                            write_whole(record, content)
             for folder in sorted(missing, reverse=True):  # inner folders first
                 with contextlib.suppress(OSError):  # the folder is not empty
                     folder.rmdir()
@@ -216,7 +216,7 @@ class Outputs:
             whole = done and path.exists()
             digest = file_digest(path) if whole and path.is_file() else None
             state = {"whole": whole, "state": file_state(path), "digest": digest}
-            _write(_record(path), json.dumps(note | state).encode())
+            write_whole(_record(path), json.dumps(note | state))
 
 
 def _record(output: Path) -> Path:
@@ -230,11 +230,6 @@ def _read(output: Path) -> dict[str, Any] | None:
         fields = {"inputs", "states", "settings", "values", "whole", "state", "digest"}
         return record if isinstance(record, dict) and fields <= {*record} else None
     return None
-
-
-def _write(record: Path, content: bytes) -> None:
-    with atomic_path(record) as temporary:
-        temporary.write_bytes(content)
 
 
 def inputs_of(path: Path) -> list[str]:

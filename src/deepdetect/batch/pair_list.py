@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from .._shared.atomic import atomic_path
+from .._shared.atomic import write_whole
 from .._shared.errors import DeepDetectError, MissingFileError, OptionError
 
 Pair = tuple[str, str]
@@ -51,8 +51,7 @@ def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
     """Write a list of pairs that `read_pairs` can read, and also hloc if no name has blanks."""
     blanks = any(" " in name for pair in pairs for name in pair)
     lines = [("\t" if blanks else " ").join(pair) + "\n" for pair in pairs]
-    with atomic_path(path) as temporary:
-        temporary.write_text("".join(lines), encoding="utf-8")
+    write_whole(path, "".join(lines))
 
 
 SIMILAR = 20

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.atomic import atomic_path
+from .._shared.atomic import write_whole
 from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
 from .._shared.options import numbers_of, shown, suggest_keywords
 from .camera_files import read_camera_file
@@ -211,8 +211,7 @@ class Calibration:
             (cx, cy), (width, height) = camera.centre, camera.size
             values[side] = {"focal_px": camera.focal_px, "cx": cx, "cy": cy}
             values[side] |= {"width": width, "height": height}
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(values, indent=1) + "\n")
 
     def check_sizes(self, size0: Size, size1: Size) -> None:
         """Raise a `ReconstructionError` unless the calibration is for images of these sizes."""

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 from ..batch.extraction import feature_group
 from ..batch.hdf5 import write_groups
-from ..batch.pair_list import pair_name
+from ..batch.pair_list import pair_name, write_pairs
 from ..batch.pair_matching import match_group
 from .collection import Collection, check_names, check_upright
 
@@ -58,7 +57,5 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         for pair, found in collection.matches.items()
     )
     write_groups(matches, groups)
-    with atomic_path(pairs) as temporary:
-        lines = (" ".join(pair) + "\n" for pair in collection.matches)
-        temporary.write_text("".join(lines), encoding="utf-8")
+    write_pairs(pairs, [*collection.matches])
     return features, matches, pairs

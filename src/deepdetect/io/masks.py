@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from .._shared.atomic import atomic_path
+from .._shared.atomic import write_whole
 from .image import UPRIGHT, orientation_of
 from .image_file import open_image
 
@@ -20,8 +20,7 @@ or 16 bits may be stored in a file with more bits."""
 
 def save_mask(mask: np.ndarray, path: str | Path) -> None:
     """Write a (H, W) bool mask as a 1-bit PNG, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encode_mask(mask))
+    write_whole(path, encode_mask(mask))
 
 
 def encode_mask(mask: np.ndarray) -> bytes:

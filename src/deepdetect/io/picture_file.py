@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from .._shared.atomic import atomic_path
+from .._shared.atomic import atomic_path, write_whole
 from .._shared.errors import DeepDetectError, OptionError, require_packages
 from .._shared.image_array import to_8_bits
 from .._shared.opencv import cv2
@@ -137,8 +137,7 @@ class Metadata:
         with suppress(AttributeError, ValueError):  # no CRS, or one that WKT1 cannot state
             texts[path.with_suffix(".prj")] = self.crs.to_wkt(version="WKT1_ESRI")
         for place, text in texts.items():
-            with atomic_path(place) as temporary:
-                temporary.write_text(text)
+            write_whole(place, text)
 
     def encode(self, rgb: np.ndarray, suffix: str, settings: list[int]) -> bytes:
         """Return a PNG or JPEG file of an (H, W, 3) RGB image."""
@@ -383,9 +382,7 @@ def save_picture(
     settings = []
     if suffix != ".png":
         rgb, settings = to_8_bits(rgb, value_range), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    data = metadata.encode(rgb, suffix, settings)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    write_whole(path, metadata.encode(rgb, suffix, settings))
 
 
 def picture_suffix(path: str | Path) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._shared.atomic import atomic_path
+from .._shared.atomic import atomic_path, write_whole
 from .._shared.errors import NoDepthError, OptionError, ReconstructionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
@@ -281,8 +281,7 @@ def _write(
     cameras_of = found.views, found.intrinsics, {"file_path": images}
     write_transforms(output / "transforms.json", *cameras_of, output / "model.ply")
     values = {**found.summary(), "files": [str(path) for path in found.files]}
-    with atomic_path(output / "model.json") as path:
-        path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    write_whole(output / "model.json", json.dumps(values, indent=2) + "\n")
     failed = []
     for name in formats:
         try:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.atomic import atomic_path
+from .._shared.atomic import write_whole
 from .._shared.opencv import cv2
 from ..geometry.camera import PosedView
 from ..io.depth import depth_scale, save_depth_png
@@ -76,9 +76,7 @@ def write_transforms(
             | {"transform_matrix": (world @ OPENGL).tolist()}
         )
     values = {"camera_model": "OPENCV", "ply_file_path": relative(points), **more}
-    with atomic_path(path) as temporary:
-        text = json.dumps({**values, "frames": frames}, indent=1)
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_whole(path, json.dumps({**values, "frames": frames}, indent=1) + "\n")
 
 
 def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
@@ -118,8 +116,7 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
         rgb = found.intrinsics[name].undistort(rgb, view.camera)
         quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         _, data = cv2.imencode(images[name].suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), quality)
-        with atomic_path(images[name]) as path:
-            path.write_bytes(data.tobytes())
+        write_whole(images[name], data.tobytes())
         seen = seen_depths(view, found.cloud.points)
         save_depth_png(seen, depths[name], found.cloud.unit, scale)
     chosen = thinned(found.dense.points, found.dense_errors, SPLAT_POINTS)

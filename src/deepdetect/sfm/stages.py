@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .. import __version__
-from .._shared.atomic import atomic_path
+from .._shared.atomic import atomic_path, write_whole
 from .._shared.errors import (
     ImageError,
     MissingImageError,
@@ -400,8 +400,7 @@ class Stages:
             "verified": [[*pair, count] for pair, count in verified.items()],
             "components": [sorted(names) for names in components],
         }
-        with atomic_path(record) as path:
-            path.write_text(json.dumps(noted), encoding="utf-8")
+        write_whole(record, json.dumps(noted))
         return model, verified, components
 
     def dense(self, folder: Path, sparse: SparseModel) -> np.ndarray:
