@@ -7,7 +7,7 @@ import sys
 import pytest
 from tests.command_line import run_command
 
-from deepdetect.cli._app import COMMANDS, make_app, with_flags
+from deepdetect.cli._app import COMMANDS, _all_commands, make_app, with_flags
 from deepdetect_lab.cli import COMMANDS as LAB_COMMANDS
 from deepdetect_lab.cli import DEVELOPMENT
 
@@ -51,12 +51,14 @@ def test_without_the_laboratory_one_sentence_says_what_to_install(
     words: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.metadata.entry_points", lambda group: ())
+    _all_commands.cache_clear()
     make_app.cache_clear()
     result = run_command(words)
     assert result.exit_code == 2
     assert len(result.stderr.splitlines()) == 1
     assert "pip install ./lab" in result.stderr
     assert "train" not in run_command(["--help"]).stdout
+    _all_commands.cache_clear()
     make_app.cache_clear()
 
 

@@ -133,6 +133,7 @@ def make_app(summaries: bool = False) -> App:
     return app
 
 
+@functools.cache  # since reading the entry points of all packages takes time
 def _all_commands() -> tuple[Commands, Commands]:
     """Return the commands of this package and of deepdetect-lab, and those of `deepdetect dev`."""
     commands = {
@@ -149,11 +150,6 @@ def _all_commands() -> tuple[Commands, Commands]:
 def _module_of(words: Sequence[str]) -> str | None:
     """Return the module of the command in a command line, or None if no command is named."""
     name = next((word for word in words if word != "dev"), "")
-    if words[:1] != ["dev"]:
-        own = (group[name][0] for group in COMMANDS.values() if name in group)
-        if module := next(own, None):
-            return f"{__package__}.{module}"
-    # Reading other packages' entry points takes time, so it comes after the search of `COMMANDS`.
     commands, development = _all_commands()
     if words[:1] and words[0] in LAB_COMMANDS and not development:
         raise MissingExtraError(

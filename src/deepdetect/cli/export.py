@@ -30,7 +30,7 @@ from ..io.image import find_images
 from ..sfm.colmap import import_pycolmap, initial_intrinsics, known_cameras
 from ..sfm.pipeline import reconstruct_many
 from . import _options as cli
-from .reconstruct import MANY
+from .reconstruct import MANY, POSE
 
 export = App("export", help="Write files for other programs.")
 
@@ -43,13 +43,8 @@ SAVED = cli.From(
 FOLDER = cli.From(match_folder, "pairs", more="workers", types={"pairs": str | None})
 MAX_KEYPOINTS = cli.From(PointDetector, "max_keypoints", more="")
 VERIFY = cli.From(write_colmap, "verify", more="")
-CAMERAS = cli.From(
-    reconstruct_many,
-    "calibration focal_px",
-    more="",
-    flags={"focal_px": "--focal"},
-    types={"calibration": Path | None},
-    defaults={"focal_px": "from EXIF, or a guess"},
+CAMERAS = replace(
+    POSE, target=reconstruct_many, more="", defaults={"focal_px": "from EXIF, or a guess"}
 )
 SHARED_CAMERA = replace(MANY, more="single_camera")
 ONNX = cli.From(

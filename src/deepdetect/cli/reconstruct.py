@@ -32,14 +32,7 @@ CAMERAS = cli.From(
     types={"calibration": Path | None},
     defaults={"focal_px": "from EXIF", "rectified": "detected"},
 )
-POSE = cli.From(
-    estimate_pose,
-    "calibration focal_px",
-    more="seed",
-    flags={"focal_px": "--focal"},
-    types={"calibration": Path | None},
-    defaults={"focal_px": "from EXIF"},
-)
+POSE = replace(CAMERAS, target=estimate_pose, common="calibration focal_px", more="seed")
 MANY = cli.From(
     MultiViewOptions,
     flags={
