@@ -39,6 +39,7 @@ from ..detector.points.descriptor import describe_learned
 from ..detector.points.detection import rank_candidates
 from ..detector.points.hessian_scales import build_scale_space
 from ..features.keypoints import Keypoints
+from ..io.image import MINIMUM_SIDE
 from ..io.image_file import IMAGE_SUFFIXES
 from .jobs import AppOptions, Jobs
 from .tasks import TASKS, Order, SentImage
@@ -64,7 +65,6 @@ MAX_POINTS = 4000
 """Maximum number of points in a request, as the page's slider allows. Each point takes
 `POINT_BYTES`: x, y and a size in float32."""
 
-MIN_SIDE = 16
 MAX_DESCRIPTION_BYTES = 1 << 18
 """Maximum bytes of the JSON with a task's options and the names and sizes of its images."""
 
@@ -300,7 +300,7 @@ class AppServer:
             width, height = (int(request.query_params[name]) for name in ("width", "height"))
         except (KeyError, ValueError):
             raise HTTPException(400, "the size of the image is missing") from None
-        if min(width, height) < MIN_SIDE or width * height > MAX_IMAGE_PIXELS:
+        if min(width, height) < MINIMUM_SIDE or width * height > MAX_IMAGE_PIXELS:
             raise HTTPException(400, f"an image of {width}x{height} pixels is not accepted here")
         length = channels * width * height
         points = _body_length(request, length + POINT_BYTES * max_points) - length

@@ -28,14 +28,12 @@ from ..matching.registration import register
 from ..matching.stitching import stages_of, stitch
 from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct
+from ..sfm.colmap import ESTIMATED_FOCAL_FACTOR
 from ..sfm.pipeline import reconstruct_many
 
 FOLDER_KEYPOINTS = 2048
 MODEL_STAGES = 9
 """Maximum number of progress stages of a 3D model, including the writing of its files."""
-
-ASSUMED_FOCAL = 1.2
-"""Focal length assumed for images without EXIF, in units of the longer side, as in COLMAP."""
 
 Report = Callable[[str, int, int], None]
 """Function called when a stage begins, with its name, the number of stages done, and the number
@@ -184,7 +182,7 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
         try:
             calibration_from_exif(left, right, *sizes)
         except ReconstructionError:
-            focal_px, assumed = ASSUMED_FOCAL * max(sizes[0]), True
+            focal_px, assumed = ESTIMATED_FOCAL_FACTOR * max(sizes[0]), True
     found = reconstruct(
         left,
         right,
@@ -196,7 +194,7 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
     files = {ending: folder / f"model{ending}" for ending in ENDINGS}
     values = save_reconstruction(found, files, " and ".join(one.name for one in images))
     focal = (
-        f"{focal_px:.0f} px, assumed: {ASSUMED_FOCAL} times the longer side"
+        f"{focal_px:.0f} px, assumed: {ESTIMATED_FOCAL_FACTOR} times the longer side"
         if assumed
         else found.calibration.source
     )

@@ -91,8 +91,14 @@ def read_tags(image: Any) -> tuple[dict[int, Any], dict[str, Any]]:
 
 
 def _number(value: Any) -> float:
+    """Return a finite number above 0, or 0 for any other value."""
+    number = number_of(value)
+    return number if 0 < number < np.inf else 0.0
+
+
+def number_of(value: Any) -> float:
+    """Return the number that a tag stands for, or NaN."""
     try:
-        number = float(value)
+        return float(value)
     except (TypeError, ValueError, ZeroDivisionError):
-        return 0.0
-    return number if np.isfinite(number) and number > 0 else 0.0
+        return np.nan

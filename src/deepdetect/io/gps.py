@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from PIL.ExifTags import GPS, IFD, Base
 
+from .exif import number_of
 from .image_file import open_image
 
 XMP_OF_DRONES = re.compile(rb"(?<!/)drone-dji:(\w+)\s*(?:=\s*[\"']([^\"']*)|>([^<]*))")
@@ -56,12 +57,12 @@ def read_gps(path: Path) -> GpsFix | None:
         with open_image(path) as image:
             exif, xmp = image.getexif(), image.info.get("xmp") or b""
             tags = dict(exif.get_ifd(IFD.GPSInfo))
-            version = _number(exif.get_ifd(IFD.Exif).get(Base.ExifVersion))
+            version = number_of(exif.get_ifd(IFD.Exif).get(Base.ExifVersion))
         orientation = exif.get(Base.Orientation, 1)
     except Exception:  # Pillow raises many types of errors; broken tags are ignored
         return None
     found = XMP_OF_DRONES.findall(xmp if isinstance(xmp, bytes) else xmp.encode())
-    drone = {name.decode(): _number(one or other) for name, one, other in found}
+    drone = {name.decode(): number_of(one or other) for name, one, other in found}
     signs = (str(tags.get(tag, "")) for tag in (GPS.GPSLatitudeRef, GPS.GPSLongitudeRef))
     north_south, east_west = (sign.strip().upper()[:1] for sign in signs)
     latitude = _degrees(tags.get(GPS.GPSLatitude), north_south == "S")
@@ -70,7 +71,7 @@ def read_gps(path: Path) -> GpsFix | None:
     # 0: above, 1: below sea level or, since EXIF 3.0, the ellipsoid. 2: above, 3: below sea level.
     reference = tags.get(GPS.GPSAltitudeRef, 0)
     reference = reference[0] if isinstance(reference, bytes) else reference
-    altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if reference in (1, 3) else 1)
+    altitude = number_of(tags.get(GPS.GPSAltitude)) * (-1 if reference in (1, 3) else 1)
     # Older drones write "Longtitude".
     east = drone.get("GpsLongitude", drone.get("GpsLongtitude", np.nan))
     north, absolute = (drone.get(name, np.nan) for name in ("GpsLatitude", "AbsoluteAltitude"))
@@ -82,7 +83,7 @@ def read_gps(path: Path) -> GpsFix | None:
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
         return None
     spread = np.hypot(drone.get("RtkStdLat", np.nan), drone.get("RtkStdLon", np.nan))
-    accuracy = float(spread) if spread > 0 else _number(tags.get(GPS.GPSHPositioningError))
+    accuracy = float(spread) if spread > 0 else number_of(tags.get(GPS.GPSHPositioningError))
     return GpsFix(
         latitude,
         longitude,
@@ -106,13 +107,6 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 def _degrees(value: Any, below: bool) -> float:
     """Convert degrees, minutes, seconds to degrees: negative if `below` (S, W), NaN if invalid."""
-    degrees, minutes, seconds = [*map(_number, np.ravel(value)), 0.0, 0.0][:3]
+    degrees, minutes, seconds = [*map(number_of, np.ravel(value)), 0.0, 0.0][:3]
     sum_ = degrees + minutes / 60 + (seconds if np.isfinite(seconds) else 0) / 3600
     return -sum_ if below else sum_
-
-
-def _number(value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return np.nan
