@@ -85,26 +85,16 @@ class Keypoints:
         if not (np.isfinite(xy).all() and np.isfinite(scores).all()):
             raise OptionError("keypoints need finite positions and scores")
         fields = {"xy": xy, "scores": scores}
-        for name, dtype in _OPTIONAL.items():
-            if getattr(self, name) is not None:
-                fields[name] = values = numbers_of(name, getattr(self, name), dtype)
-                if values.shape != scores.shape:
-                    raise OptionError(
-                        f"{len(scores)} keypoints need (N,) {name}, not {values.shape}"
-                    )
-                if name != "logits" and not np.isfinite(values).all():
-                    raise OptionError(f"keypoints need finite {name}")
-        if self.descriptors is not None:
-            whole = getattr(self.descriptors, "dtype", None) == np.uint8
-            kind = np.uint8 if whole else np.float32
-            descriptors = numbers_of("descriptors", self.descriptors, kind)
-            if descriptors.ndim != 2 or len(descriptors) != len(scores):
-                raise OptionError(
-                    f"{len(scores)} keypoints need (N, D) descriptors, not {descriptors.shape}"
-                )
-            if not whole and not np.isfinite(descriptors).all():
-                raise OptionError("keypoints need finite descriptors")
-            fields["descriptors"] = descriptors
+        whole = getattr(self.descriptors, "dtype", None) == np.uint8
+        for name, dtype in {**_OPTIONAL, "descriptors": np.uint8 if whole else np.float32}.items():
+            if getattr(self, name) is None:
+                continue
+            fields[name] = values = numbers_of(name, getattr(self, name), dtype)
+            shape, axes = ("(N, D)", 2) if name == "descriptors" else ("(N,)", 1)
+            if values.ndim != axes or len(values) != len(xy):
+                raise OptionError(f"{len(xy)} keypoints need {shape} {name}, not {values.shape}")
+            if name != "logits" and values.dtype.kind == "f" and not np.isfinite(values).all():
+                raise OptionError(f"keypoints need finite {name}")
         for name, values in fields.items():
             object.__setattr__(self, name, values)
         size = numbers_of("image_size", self.image_size, np.float64)

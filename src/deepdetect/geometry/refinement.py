@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -48,68 +47,54 @@ def refine_fundamental(
     medians = [np.median(epipolar_errors(*each, fundamental)) for each in sources]
     sigmas = np.maximum(MAD_STD * np.array(medians), MIN_SIGMA_PX)
     cameras = _nearest_cameras(fundamental, sizes)
-    essential = cameras.essential(fundamental)
-    pose = best_of_four(essential, points0, points1, cameras.calibration)
+    start = _calibration(cameras, sizes)
+    pose = best_of_four(_essential(fundamental, start), points0, points1, start)
     of_matches = np.repeat(sigmas, [len(each[0]) for each in sources])
     pose, cameras = fit_to_lines(
         (pose, cameras),
         points0,
         points1,
         of_matches,
-        lambda views: fundamental_matrix(views[1].calibration, *views[0]),
-        lambda views, change: (moved_pose(views[0], change[:5]), views[1].moved(change[5:])),
+        lambda views: fundamental_matrix(_calibration(views[1], sizes), *views[0]),
+        lambda views, change: (moved_pose(views[0], change[:5]), views[1] + change[5:]),
         np.eye(11),
-        prior=lambda views: views[1].deviations(),
+        prior=lambda views: _deviations(views[1]),
     )
-    matrix = fundamental_matrix(cameras.calibration, *pose)
+    matrix = fundamental_matrix(_calibration(cameras, sizes), *pose)
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Cameras:
+def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> np.ndarray:
     """Return the cameras whose focal length brings `fundamental` closest to an essential matrix."""
 
-    def likeness(cameras: _Cameras) -> float:
-        largest, middle, _ = np.linalg.svd(cameras.essential(fundamental), compute_uv=False)
+    def likeness(cameras: np.ndarray) -> float:
+        essential = _essential(fundamental, _calibration(cameras, sizes))
+        largest, middle, _ = np.linalg.svd(essential, compute_uv=False)
         return float(middle / largest)
 
-    return max((_Cameras.guess(sizes, focal) for focal in START_FOCAL_LENGTHS), key=likeness)
+    guesses = (np.array([math.log(focal)] * 2 + [0.0] * 4) for focal in START_FOCAL_LENGTHS)
+    return max(guesses, key=likeness)
 
 
-@dataclass(frozen=True, eq=False)
-class _Cameras:
-    """The two cameras, as six parameters in units of the longer side of each image.
+def _calibration(cameras: np.ndarray, sizes: tuple[Size, Size]) -> Calibration:
+    """Return the two cameras of six parameters in units of the longer side of each image.
 
-    `log_focal` (2,) are natural logarithms of the focal lengths, and `offsets` (2, 2) the principal
-    points minus the image centres.
+    These are the natural logarithms of both focal lengths, and x and y of both principal points
+    minus the image centres.
     """
+    made = []
+    for size, log_focal, offset in zip(sizes, cameras[:2], cameras[2:].reshape(2, 2), strict=True):
+        centre = (np.array(size) - 1) / 2 + offset * max(size)
+        made.append(Camera(size, math.exp(log_focal) * max(size), tuple(centre)))
+    return Calibration(made[0], made[1])
 
-    sizes: tuple[Size, Size]
-    log_focal: np.ndarray
-    offsets: np.ndarray
 
-    @classmethod
-    def guess(cls, sizes: tuple[Size, Size], focal: float) -> _Cameras:
-        return cls(sizes, np.full(2, math.log(focal)), np.zeros((2, 2)))
+def _essential(fundamental: np.ndarray, calibration: Calibration) -> np.ndarray:
+    return calibration.camera1.matrix.T @ fundamental @ calibration.camera0.matrix
 
-    @property
-    def calibration(self) -> Calibration:
-        cameras = []
-        for size, log_focal, offset in zip(self.sizes, self.log_focal, self.offsets, strict=True):
-            side = max(size)
-            centre = (np.array(size) - 1) / 2 + offset * side
-            cameras.append(Camera(size, math.exp(log_focal) * side, tuple(centre)))
-        return Calibration(cameras[0], cameras[1])
 
-    def essential(self, fundamental: np.ndarray) -> np.ndarray:
-        calibration = self.calibration
-        return calibration.camera1.matrix.T @ fundamental @ calibration.camera0.matrix
-
-    def moved(self, change: np.ndarray) -> _Cameras:
-        offsets = self.offsets + change[2:].reshape(2, 2)
-        return _Cameras(self.sizes, self.log_focal + change[:2], offsets)
-
-    def deviations(self) -> np.ndarray:
-        """Return the (6,) deviations from the prior, each in units of its standard deviation."""
-        mean, difference = self.log_focal.mean(), self.log_focal[0] - self.log_focal[1]
-        of_focal = [mean / FOCAL_SPREAD, difference / FOCAL_DIFFERENCE]
-        return np.append(of_focal, self.offsets / PRINCIPAL_POINT_SPREAD)
+def _deviations(cameras: np.ndarray) -> np.ndarray:
+    """Return the (6,) deviations from the prior, each in units of its standard deviation."""
+    mean, difference = cameras[:2].mean(), cameras[0] - cameras[1]
+    of_focal = [mean / FOCAL_SPREAD, difference / FOCAL_DIFFERENCE]
+    return np.append(of_focal, cameras[2:] / PRINCIPAL_POINT_SPREAD)
