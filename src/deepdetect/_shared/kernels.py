@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import MissingExtraError, first_line
+from .machine import temporarily
 
 _announcement: list[Callable[[], object]] = []
 
@@ -55,20 +56,15 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
         ) from None
     if _announcement:
         _listen()
-    config: Any = numba.config  # type checkers do not know numba's settings
 
     def decorate(function: Callable[..., Any]) -> Any:
         with suppress(RuntimeError):  # numba found no writable cache folder
             return numba.njit(cache=True, **flags)(function)
-        before = config.CACHE_DIR
-        try:
-            # Numba reads `CACHE_DIR` while a function is decorated, not when it is called.
-            config.CACHE_DIR = str(_temporary_folder())
+        missing = AttributeError, OSError, RuntimeError  # AttributeError: Windows lacks `getuid`
+        # Numba reads `CACHE_DIR` while a function is decorated, not when it is called.
+        with suppress(*missing), temporarily(numba.config, CACHE_DIR=str(_temporary_folder())):
             return numba.njit(cache=True, **flags)(function)
-        except (AttributeError, OSError, RuntimeError):  # AttributeError: Windows lacks `getuid`
-            return numba.njit(**flags)(function)
-        finally:
-            config.CACHE_DIR = before
+        return numba.njit(**flags)(function)
 
     return decorate
 

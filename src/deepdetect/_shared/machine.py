@@ -64,11 +64,29 @@ _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD: blocks from 1 MB on are mappe
 _max_threads: int | None = None
 """`parallel_for` uses at most this number of threads in this process; None: one per processor."""
 
-_chosen = threading.local()
+
+class _Chosen(threading.local):
+    threads: int | None = None
+
+
+_chosen = _Chosen()
 """The attribute `threads` is the limit that `limited_threads` has set in the current thread."""
 
 TaskMap = Callable[..., Iterator[Any]]
 """Type of `map_in_processes`, and of functions that do the same on a cluster."""
+
+
+@contextmanager
+def temporarily(target: object, **values: Any) -> Iterator[None]:
+    """Set attributes of an object, such as the settings of a library, while the block runs."""
+    before = {name: getattr(target, name) for name in values}
+    for name, value in values.items():
+        setattr(target, name, value)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(target, name, value)
 
 
 def processor_count() -> int:
@@ -211,13 +229,9 @@ def limited_threads(threads: int | None = None) -> Iterator[None]:
     """
     from threadpoolctl import threadpool_limits
 
-    before = getattr(_chosen, "threads", None)
-    _chosen.threads = threads or before
-    try:
-        with threadpool_limits(1, user_api="blas"):
-            yield
-    finally:
-        _chosen.threads = before
+    limited = temporarily(_chosen, threads=threads or _chosen.threads)
+    with limited, threadpool_limits(1, user_api="blas"):
+        yield
 
 
 def thread_limit() -> int | None:
@@ -227,8 +241,8 @@ def thread_limit() -> int | None:
     always get a number, because by default ONNX Runtime binds its threads to the same processors
     in every process.
     """
-    if chosen := getattr(_chosen, "threads", None):
-        return int(chosen)
+    if _chosen.threads:
+        return _chosen.threads
     if _max_threads is not None:
         return _max_threads
     wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]

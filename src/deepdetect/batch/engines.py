@@ -25,6 +25,7 @@ from .._shared.machine import (
     map_in_processes,
     processor_count,
     recorded,
+    temporarily,
     told,
     use_one_thread,
 )
@@ -140,18 +141,14 @@ def _connected(ray: Any, workers: int | None) -> Iterator[None]:
                 ) from error
             _start_cluster(ray, workers or processor_count(), quiet)
     context = ray.data.DataContext.get_current()
-    usual = {name: getattr(context, name) for name in DATA_SETTINGS}
-    for name, value in DATA_SETTINGS.items():
-        setattr(context, name, value)
     logger = logging.getLogger("ray.data")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:
-        yield
+        with temporarily(context, **DATA_SETTINGS):
+            yield
     finally:
         logger.setLevel(level)
-        for name, value in usual.items():
-            setattr(context, name, value)
         if not before:
             ray.shutdown()
 

@@ -30,6 +30,7 @@ from .._shared.errors import (
     OptionError,
     first_line,
 )
+from .._shared.machine import temporarily
 from .._shared.options import shown, suggest_keywords, whole
 from .._shared.value_range import ValueRange
 
@@ -203,6 +204,8 @@ def open_image(
             larger than `max_megapixels`, or not an image.
         MissingExtraError: it is a HEIF or raw image, and the package for it is not installed.
     """
+    from PIL import ImageFile
+
     options = options or reading_options()
     with open_file(source, what) as (file, name):
         if not options.allow_truncated:
@@ -213,21 +216,10 @@ def open_image(
                 if options.page >= (pages := getattr(image, "n_frames", 1)):
                     raise ImageError(f"{name} has {pages} pages: give a `page` below that")
                 image.seek(options.page)
-            with _truncated(options.allow_truncated):
+            # Pillow has one such setting for all threads.
+            allowed = ImageFile.LOAD_TRUNCATED_IMAGES or options.allow_truncated
+            with temporarily(ImageFile, LOAD_TRUNCATED_IMAGES=allowed):
                 yield image
-
-
-@contextmanager
-def _truncated(allowed: bool) -> Iterator[None]:
-    """Let Pillow read truncated files in the block; the setting affects all threads."""
-    from PIL import ImageFile
-
-    before = ImageFile.LOAD_TRUNCATED_IMAGES
-    ImageFile.LOAD_TRUNCATED_IMAGES = before or allowed
-    try:
-        yield
-    finally:
-        ImageFile.LOAD_TRUNCATED_IMAGES = before
 
 
 @contextmanager

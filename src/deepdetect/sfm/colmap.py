@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import ReconstructionError
+from .._shared.machine import temporarily
 from .._shared.opencv import cv2
 from .._shared.opencv import import_pycolmap as import_pycolmap
 from ..batch.extraction import ROOT_SIFT_NORM
@@ -40,12 +41,8 @@ ESTIMATED_FOCAL_FACTOR = 1.2
 def quiet_pycolmap() -> Iterator[Any]:
     """Return pycolmap with its log switched off inside the `with` block."""
     pycolmap = import_pycolmap()
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    try:
+    with temporarily(pycolmap.logging, minloglevel=int(pycolmap.logging.FATAL)):
         yield pycolmap
-    finally:
-        pycolmap.logging.minloglevel = before
 
 
 @dataclass(frozen=True)
