@@ -531,7 +531,7 @@ def test_what_is_upright() -> None:
         str(k): PosedView(str(k), CAMERA, NORTH_LEVEL @ turn("z", 50 * k), np.zeros(3))
         for k in range(5)
     }
-    up, level, stds = upright(views)
+    up, level, stds = upright(views).values()
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-3)
     np.testing.assert_allclose(level @ [0, 0, 1], 0, atol=1e-9)
     assert len(stds) == len(level) == 10

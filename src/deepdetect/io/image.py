@@ -255,21 +255,14 @@ def found_in_each(
     with one_range(images, channels) as reading:
         pass
     for number, image in enumerate(images):
-        with image_named(number):
+        try:
             with read_with(reading):
                 pixels = load_pixels(image, channels)
             found.append(find(pixels, masks[number]))
+        except (ImageError, OptionError) as error:
+            raise type(error)(f"images[{number}]: {error}") from None
         del pixels
     return found
-
-
-@contextmanager
-def image_named(number: int) -> Iterator[None]:
-    """Prefix messages of errors that the block raises with the index of the image in its list."""
-    try:
-        yield
-    except (ImageError, OptionError) as error:
-        raise type(error)(f"images[{number}]: {error}") from None
 
 
 def at_pixels(mask: np.ndarray | None, xy: np.ndarray) -> np.ndarray:

@@ -248,7 +248,7 @@ def _place(
     places: np.ndarray,
     accuracy: float,
     heights: str,
-    level: tuple[np.ndarray, np.ndarray, np.ndarray],
+    level: Mapping[str, np.ndarray],
     scale: float | None,
     error: float | None = None,
 ) -> Georeference:
@@ -261,8 +261,8 @@ def _place(
     targets = origin.to_enu(places)
     targets[unknown, 2] = np.nan
     own = np.array([*points.values()])
-    known: Any = dict(zip(("up", "level", "level_stds"), level, strict=True))
-    known, fit = {**known, "scale": scale, "accuracy": accuracy}, None
+    known: Any = {**level, "scale": scale, "accuracy": accuracy}
+    fit = None
     with suppress(ReconstructionError):
         fit = fit_similarity(own, targets, **known)
         if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
@@ -345,8 +345,8 @@ def _is_bent(fit: SimilarityFit, targets: np.ndarray) -> bool:
 
 def upright(
     views: Mapping[str, PosedView], gravities: Mapping[str, np.ndarray | None] = {}
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the unit vector up (3,), and `fit_similarity`'s arguments `level` and `level_stds`.
+) -> dict[str, np.ndarray]:
+    """Return `fit_similarity`'s arguments `up` (a unit vector), `level` and `level_stds`.
 
     If a gimbal reports gravity, directions perpendicular to gravity are level. Otherwise, image
     rows and, less certainly, optical axes are assumed to be level.
@@ -367,7 +367,8 @@ def upright(
         across, *others = np.array([view.rotation for view in views.values()]).swapaxes(0, 1)
         above = -(others[0] + DOWNWARD_SHARE * others[1]).mean(axis=0)
         up = np.linalg.solve(across.T @ across / len(across) + 1e-3 * np.eye(3), above)
-    return up / np.linalg.norm(up), np.array(level), np.radians(stds)
+    up /= np.linalg.norm(up)
+    return {"up": up, "level": np.array(level), "level_stds": np.radians(stds)}
 
 
 def georeference_by_control_points(
