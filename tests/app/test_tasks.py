@@ -16,7 +16,7 @@ from deepdetect import load_image, load_matches, register
 from deepdetect._shared.errors import DeepDetectError
 from deepdetect.app import tasks
 from deepdetect.app.tasks import TASKS, SentImage, TaskResult
-from deepdetect.reconstruction.files import ENDINGS
+from deepdetect.reconstruction.result import ENDINGS
 
 EXAMPLES = Path(deepdetect.__path__[0]) / "app/static/examples"
 

@@ -26,8 +26,8 @@ from ..io.tables import save_keypoints, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_images
 from ..matching.registration import register
 from ..matching.stitching import stages_of, stitch
-from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct
+from ..reconstruction.result import ENDINGS, save_reconstruction
 from ..sfm.colmap import ESTIMATED_FOCAL_FACTOR
 from ..sfm.pipeline import reconstruct_many
 

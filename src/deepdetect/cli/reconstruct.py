@@ -14,9 +14,9 @@ from .._shared.progress import stage_progress
 from .._shared.records import Outputs
 from ..io.image import load_image
 from ..io.point_cloud import find_writer
-from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import estimate_pose
 from ..reconstruction.pipeline import reconstruct as reconstruct_pair
+from ..reconstruction.result import ENDINGS, save_reconstruction
 from ..sfm.colmap import import_pycolmap
 from ..sfm.formats import check_formats
 from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many

@@ -1,9 +1,13 @@
-"""The result of a reconstruction of two images: 3D points and statistics."""
+"""The result of a reconstruction of two images: 3D points and statistics, and its files."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
+import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +17,13 @@ from .._shared.options import suggest_keywords
 from ..geometry.camera import Calibration, Camera, angles_between
 from ..geometry.point_cloud import PointCloud
 from ..geometry.relative_pose import RelativePose
+from ..io.depth import save_depth_npz, save_depth_png
+from ..io.picture_file import save_picture
+from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
+from ..viz.draw import draw_depth
 from .rectification import Rectification
+
+ENDINGS = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", "_depth.jpg", ".json")
 
 PERCENTILES = (0, 5, 25, 50, 75, 95, 100)
 
@@ -202,3 +212,29 @@ def _finite(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_finite(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def save_reconstruction(
+    found: Reconstruction, paths: Mapping[str, Path], title: str, **values: Any
+) -> dict[str, Any]:
+    """Write a file for each of `ENDINGS`; return what the JSON contains, including `values`."""
+    started = time.perf_counter()
+    summary = found.summary()
+    notes = {
+        "title": title,
+        "pair": "rectified" if found.rectified else "not rectified",
+        "calibration": found.calibration.source,
+        "scale": summary["scale"],
+    }
+    for ending in POINT_CLOUD_WRITERS:
+        save_point_cloud(found.cloud, paths[ending], notes)
+    depth = found.depth_map()
+    stored = save_depth_png(depth, paths["_depth.png"], found.unit)
+    arrays = {} if found.disparity is None else {"disparity": found.disparity_map()}
+    save_depth_npz(depth, paths["_depth.npz"], found.unit, matched=found.matched_map(), **arrays)
+    save_picture(draw_depth(depth, found.unit), paths["_depth.jpg"])
+    summary["seconds"]["files"] = round(time.perf_counter() - started, 4)
+    numbers = {**summary, "depth_png": stored, **values}
+    text = json.dumps(numbers, indent=2, default=str) + "\n"
+    paths[".json"].write_text(text, encoding="utf-8")
+    return numbers

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import NoDepthError
-from ..batch.pair_list import Pair
+from ..batch.pair_list import Pair, largest_component
 from ..geometry.camera import PosedView, camera_spacing
 from ..geometry.lens import MIN_DEVIATIONS, UNDISTORT, deviations
 from ..geometry.similarity import Similarity
 from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
-from .pair_selection import largest_component
 
 MIN_VERIFIED = 30
 """A pair of images is used only if its two-view geometry has at least this many inliers. Unrelated

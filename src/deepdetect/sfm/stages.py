@@ -32,7 +32,15 @@ from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
 from ..batch.extraction import extract_features
 from ..batch.hdf5 import feature_names, open_hdf5
-from ..batch.pair_list import Pair, following, list_pairs, pair_name, similar
+from ..batch.pair_list import (
+    Pair,
+    following,
+    list_pairs,
+    motion,
+    pair_name,
+    similar,
+    thin_out,
+)
 from ..batch.pair_matching import PairMatchingOptions, first_keypoints, match_pairs
 from ..batch.similar_pairs import similar_pairs
 from ..detector.detector import DeepDetect
@@ -63,7 +71,6 @@ from .mapping import (
     verify_pairs,
 )
 from .misplaced import correct_places
-from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect.sfm.pair_selection import motion, thin_out
+from deepdetect.batch.pair_list import motion, thin_out
 
 
 def test_frames_are_left_out_up_to_the_first_that_shows_something_new() -> None:
