@@ -74,7 +74,10 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
 
     def correlation(warped: np.ndarray, valid_mask: np.ndarray) -> np.ndarray:
         known = erode_mask(valid_mask, BLUR_SIGMA_PX)
-        return local_zncc(blurred, gaussian_blur(warped, BLUR_SIGMA_PX), known, step_px=STEP_PX)
+        found = local_zncc(blurred, gaussian_blur(warped, BLUR_SIGMA_PX), known)
+        return found[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX][
+            : inner.shape[0], : inner.shape[1]
+        ]
 
     equalised = equalise(gray0)
     steps: list[Callable[[np.ndarray, np.ndarray], Fit]] = [

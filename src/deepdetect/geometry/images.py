@@ -108,42 +108,26 @@ def warp_bands(
 
 
 def local_zncc(
-    first: np.ndarray,
-    second: np.ndarray,
-    valid_mask: np.ndarray,
-    window_px: int = WINDOW_PX,
-    step_px: int = 1,
+    first: np.ndarray, second: np.ndarray, valid_mask: np.ndarray, window_px: int = WINDOW_PX
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation (ZNCC) of windows at the same positions.
 
-    A window of side `window_px`, an odd multiple of `step_px`, is centred on each square of side
-    `step_px`. Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for windows that
-    are flat (up to `MIN_VARIANCE`) or partly outside `valid_mask`.
+    A window of side `window_px`, an odd number, is centred on each pixel. Returns (H, W) float32 in
+    [-1, 1], NaN for windows that are flat (up to `MIN_VARIANCE`) or partly outside `valid_mask`.
     """
-    side = window_px // step_px
-    shape = (first.shape[0] // step_px, first.shape[1] // step_px)
-    if 0 in shape:
-        return np.full(shape, np.nan, np.float32)
-    a, b, mask = (
-        values[: shape[0] * step_px, : shape[1] * step_px] for values in (first, second, valid_mask)
-    )
-    a, b = a.astype(np.float64), b.astype(np.float64)
-
-    def at_steps(values: np.ndarray) -> np.ndarray:
-        if step_px == 1:
-            return values
-        return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_AREA)
+    a, b = first.astype(np.float64), second.astype(np.float64)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return cv2.boxFilter(at_steps(values), cv2.CV_64F, (side, side))
+        return cv2.boxFilter(values, cv2.CV_64F, (window_px, window_px))
 
     mean_a, mean_b = mean(a), mean(b)
     variance_a = mean(a * a) - mean_a**2
     variance_b = mean(b * b) - mean_b**2
-    inside = _erode(at_steps(mask.astype(np.float32)) > 1 - 0.5 / step_px**2, side)
-    known = inside & (variance_a > MIN_VARIANCE) & (variance_b > MIN_VARIANCE)
+    known = (
+        _erode(valid_mask, window_px) & (variance_a > MIN_VARIANCE) & (variance_b > MIN_VARIANCE)
+    )
     covariance = mean(a * b) - mean_a * mean_b
-    result = np.full(shape, np.nan, np.float32)
+    result = np.full(first.shape, np.nan, np.float32)
     scale = np.sqrt(variance_a[known] * variance_b[known])
     result[known] = np.clip(covariance[known] / scale, -1, 1)
     return result
