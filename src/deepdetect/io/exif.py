@@ -80,12 +80,17 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
     return length * across / unit * scale, length * down / unit * scale
 
 
-def read_tags(image: Any) -> tuple[dict[int, Any], dict[str, Any]]:
-    """Return the EXIF tags of a file or PIL image, and Pillow's `info` of it, with "size" added."""
+def read_tags(image: Any, *directories: IFD) -> tuple[dict[int, Any], dict[str, Any]]:
+    """Return the EXIF tags of a file or PIL image, and Pillow's `info` of it, with "size" added.
+
+    The tags of further `directories` of EXIF are added.
+    """
     try:
         with open_image(image) if is_file(image) else nullcontext(image) as opened:
-            exif = opened.getexif()
-            return dict(exif) | exif.get_ifd(IFD.Exif), opened.info | {"size": opened.size}
+            exif, tags = opened.getexif(), dict[int, Any]()
+            for part in (exif, *(exif.get_ifd(code) for code in (IFD.Exif, *directories))):
+                tags |= part
+            return tags, opened.info | {"size": opened.size}
     except Exception:  # Pillow raises many types of errors; broken tags are ignored
         return {}, {}
 

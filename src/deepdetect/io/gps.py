@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from PIL.ExifTags import GPS, IFD, Base
 
-from .exif import number_of
-from .image_file import open_image
+from .exif import number_of, read_tags
 
 XMP_OF_DRONES = re.compile(rb"(?<!/)drone-dji:(\w+)\s*(?:=\s*[\"']([^\"']*)|>([^<]*))")
 """This pattern finds XMP properties of DJI drones, which write them as attributes or elements."""
@@ -53,14 +52,8 @@ def read_gps(path: Path) -> GpsFix | None:
 
     XMP is preferred, since drones write it with more digits than EXIF.
     """
-    try:
-        with open_image(path) as image:
-            exif, xmp = image.getexif(), image.info.get("xmp") or b""
-            tags = dict(exif.get_ifd(IFD.GPSInfo))
-            version = number_of(exif.get_ifd(IFD.Exif).get(Base.ExifVersion))
-        orientation = exif.get(Base.Orientation, 1)
-    except Exception:  # Pillow raises many types of errors; broken tags are ignored
-        return None
+    tags, notes = read_tags(path, IFD.GPSInfo)
+    xmp = notes.get("xmp") or b""
     found = XMP_OF_DRONES.findall(xmp if isinstance(xmp, bytes) else xmp.encode())
     drone = {name.decode(): number_of(one or other) for name, one, other in found}
     signs = (str(tags.get(tag, "")) for tag in (GPS.GPSLatitudeRef, GPS.GPSLongitudeRef))
@@ -77,7 +70,7 @@ def read_gps(path: Path) -> GpsFix | None:
     north, absolute = (drone.get(name, np.nan) for name in ("GpsLatitude", "AbsoluteAltitude"))
     if np.isfinite(east + north) and (north or east):
         latitude, longitude, assumed = north, east, False
-    ellipsoidal = version >= 300 and reference in (0, 1)
+    ellipsoidal = number_of(tags.get(Base.ExifVersion)) >= 300 and reference in (0, 1)
     if np.isfinite(absolute):
         altitude, ellipsoidal = absolute, drone.get("RtkFlag", 0) > 0
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
@@ -89,7 +82,7 @@ def read_gps(path: Path) -> GpsFix | None:
         longitude,
         altitude,
         accuracy if accuracy > 0 else None,
-        _gravity(drone) if orientation == 1 else None,
+        _gravity(drone) if tags.get(Base.Orientation, 1) == 1 else None,
         ELLIPSOID if ellipsoidal else SEA_LEVEL,
         drone.get("RelativeAltitude", np.nan),
         assumed,
