@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect import OptionError
-from deepdetect.sfm.georeference import ControlRow, read_control_points
+from deepdetect.sfm.control_points import ControlRow, read_control_points
 
 US_FOOT = 1200 / 3937
 FOOT = 0.3048

@@ -23,13 +23,8 @@ from deepdetect.geometry.similarity import Similarity
 from deepdetect.io.gps import read_gps
 from deepdetect.sfm import MultiViewOptions
 from deepdetect.sfm.colmap import CameraIntrinsics
-from deepdetect.sfm.georeference import (
-    Georeference,
-    Origin,
-    georeference,
-    read_control_points,
-    upright,
-)
+from deepdetect.sfm.control_points import read_control_points
+from deepdetect.sfm.georeference import Georeference, Origin, georeference, upright
 from deepdetect.sfm.mapping import RegisteredImage, SparseModel
 
 from ..io.test_gps import place_tags, write_photograph

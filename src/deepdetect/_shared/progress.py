@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partialmethod
 from typing import Any
 
 
@@ -15,18 +16,14 @@ class _StandardError:
 
     encoding = "utf-8"
 
-    def write(self, text: str) -> None:
+    def _called(self, method: str, *values: str) -> object:
         with suppress(AttributeError, OSError, ValueError):
-            sys.stderr.write(text)
-
-    def flush(self) -> None:
-        with suppress(AttributeError, OSError, ValueError):
-            sys.stderr.flush()
-
-    def isatty(self) -> bool:
-        with suppress(AttributeError, OSError, ValueError):
-            return sys.stderr.isatty()
+            return getattr(sys.stderr, method)(*values)
         return False
+
+    write = partialmethod(_called, "write")
+    flush = partialmethod(_called, "flush")
+    isatty = partialmethod(_called, "isatty")
 
 
 STDERR: Any = _StandardError()

@@ -27,10 +27,8 @@ from ..geometry.similarity import (
 from ..io.gps import ELLIPSOID, SEA_LEVEL, TAKE_OFF, GpsFix, read_gps
 from ..io.image import find_images
 from .colmap import import_pycolmap
-from .control_points import ControlRow, read_control_points
+from .control_points import ControlRow
 from .mapping import SparseModel
-
-__all__ = ["ControlRow", "Georeference", "Origin", "georeference", "read_control_points"]
 
 GPS_ACCURACY_M, CONTROL_ACCURACY_M = 3.0, 0.1
 """Assumed accuracies: of GPS positions that state none, typical of receivers in the open, and of

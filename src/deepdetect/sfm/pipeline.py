@@ -29,16 +29,10 @@ from ..io.image import one_range
 from ..io.image_file import read_with, reading_options
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras
+from .control_points import ControlRow, read_control_points
 from .formats import FORMATS, FormatName, check_formats
 from .fusion import DENSE_POINT
-from .georeference import (
-    ControlRow,
-    Georeference,
-    georeference,
-    read_control_points,
-    require_fixes,
-    require_images,
-)
+from .georeference import Georeference, georeference, require_fixes, require_images
 from .mapping import MIN_VIEWS, read_sparse_model, transform_model
 from .result import MultiViewReconstruction
 from .splat import write_transforms

@@ -32,15 +32,7 @@ from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
 from ..batch.extraction import extract_features
 from ..batch.hdf5 import feature_names, open_hdf5
-from ..batch.pair_list import (
-    Pair,
-    following,
-    list_pairs,
-    motion,
-    pair_name,
-    similar,
-    thin_out,
-)
+from ..batch.pair_list import Pair, following, list_pairs, motion, pair_name, similar, thin_out
 from ..batch.pair_matching import PairMatchingOptions, first_keypoints, match_pairs
 from ..batch.similar_pairs import similar_pairs
 from ..detector.detector import DeepDetect
