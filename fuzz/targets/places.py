@@ -14,7 +14,7 @@ from PIL import Image
 from deepdetect.cli import main
 from deepdetect.geometry import transform_points
 from deepdetect.io.picture_file import read_metadata
-from deepdetect.sfm.georeference import read_control_points
+from deepdetect.sfm.control_points import read_control_points
 
 from ..case import Target, expect
 
