@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from deepdetect.io.depth import _scale, save_depth_npz, save_depth_png
+from deepdetect.io.depth import _scale, save_depth_png
 
 
 @pytest.fixture
@@ -58,13 +58,3 @@ def test_a_chosen_scale_is_round_fits_and_is_the_finest(far: float, count: int) 
 def test_a_map_without_depths_is_all_unknown(tmp_path: Path) -> None:
     told = save_depth_png(np.full((4, 5), np.nan), tmp_path / "d.png", "mm")
     assert (told["known_pixels"], told["out_of_range"]) == (0, 0)
-
-
-def test_npz_keeps_floats_and_further_arrays(depth: np.ndarray, tmp_path: Path) -> None:
-    save_depth_npz(depth, tmp_path / "d.npz", "mm", disparity=1 / np.abs(depth + 1))
-    with np.load(tmp_path / "d.npz", allow_pickle=False) as read:
-        assert str(read["unit"]) == "mm"
-        assert read["depth"].dtype == np.float32
-        np.testing.assert_array_equal(read["depth"][6:], depth[6:])
-        assert np.isnan(read["depth"][5, :3]).all()
-        assert read["disparity"].shape == depth.shape

@@ -1,4 +1,4 @@
-"""Depth maps in files: 16-bit PNG with its scale in the file, and npz with floats."""
+"""Depth maps in files: 16-bit PNG with its scale in the file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from PIL import Image, PngImagePlugin
 
 from .._shared.atomic import atomic_path
-from .._shared.records import save_arrays
 
 MAX_UINT16 = 65535
 
@@ -44,13 +43,6 @@ def save_depth_png(
         "known_pixels": int(fits.sum()),
         "out_of_range": int((known & ~fits).sum()),
     }
-
-
-def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarray) -> None:
-    """Write `depth`, (H, W) float32 with NaN where unknown, its `unit`, and other arrays to npz."""
-    known = np.isfinite(depth) & (depth > 0)
-    stored = np.where(known, depth, np.nan).astype(np.float32)
-    save_arrays(path, {"depth": stored, "unit": unit, **arrays})
 
 
 def _scale(depths: np.ndarray) -> float:

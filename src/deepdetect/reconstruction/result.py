@@ -14,10 +14,11 @@ import numpy as np
 
 from .._shared.errors import ReconstructionError
 from .._shared.options import suggest_keywords
+from .._shared.records import save_arrays
 from ..geometry.camera import Calibration, Camera, angles_between
 from ..geometry.point_cloud import PointCloud
 from ..geometry.relative_pose import RelativePose
-from ..io.depth import save_depth_npz, save_depth_png
+from ..io.depth import save_depth_png
 from ..io.picture_file import save_picture
 from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
 from ..viz.draw import draw_depth
@@ -230,8 +231,9 @@ def save_reconstruction(
         save_point_cloud(found.cloud, paths[ending], notes)
     depth = found.depth_map()
     stored = save_depth_png(depth, paths["_depth.png"], found.unit)
-    arrays = {} if found.disparity is None else {"disparity": found.disparity_map()}
-    save_depth_npz(depth, paths["_depth.npz"], found.unit, matched=found.matched_map(), **arrays)
+    arrays: dict[str, Any] = {"depth": depth, "unit": found.unit, "matched": found.matched_map()}
+    arrays |= {} if found.disparity is None else {"disparity": found.disparity_map()}
+    save_arrays(paths["_depth.npz"], arrays)
     save_picture(draw_depth(depth, found.unit), paths["_depth.jpg"])
     summary["seconds"]["files"] = round(time.perf_counter() - started, 4)
     numbers = {**summary, "depth_png": stored, **values}
