@@ -220,8 +220,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _usage(error: CycloptsError) -> str:
     """Return the error message for a command line that does not fit its command."""
+    plain = " ".join(str(error).split())
     if not isinstance(error, MissingArgumentError | UnusedCliTokensError):
-        return " ".join(str(error).split())
+        return plain
     chain = error.command_chain or ()
     *_, app = make_app().parse_commands([*chain])[1]
     helps = {
@@ -230,14 +231,12 @@ def _usage(error: CycloptsError) -> str:
         if each.field_info.is_positional
     }
     command = f"`deepdetect {' '.join(chain)}`"
-    if isinstance(error, MissingArgumentError) and error.argument and error.argument.name in helps:
-        return f"{command} needs {helps[error.argument.name]}: its --help shows examples"
     if isinstance(error, UnusedCliTokensError):
-        unused = " ".join(error.unused_tokens or ())
-        return (
-            f"{command} takes only {' and '.join(helps.values()) or 'options'}: leave out {unused}"
-        )
-    return " ".join(str(error).split())
+        known, unused = " and ".join(helps.values()), " ".join(error.unused_tokens or ())
+        return f"{command} takes only {known or 'options'}: leave out {unused}"
+    if error.argument and error.argument.name in helps:
+        return f"{command} needs {helps[error.argument.name]}: its --help shows examples"
+    return plain
 
 
 def _call(words: Sequence[str]) -> int:

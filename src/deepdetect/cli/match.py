@@ -107,10 +107,8 @@ def match(
     inputs = [path for pair in outputs for path in pair]
     cli.check_outputs([path for files in outputs.values() for path in files.values()], inputs)
     by_descriptors = UNGUIDED.take(values)
-    if not unguided:
-        flags = [*by_descriptors, *(["descriptor"] if "descriptor" in values else [])]
-        for name in flags:
-            raise OptionError(f"`{name}` is for --unguided: add that option, or leave `{name}` out")
+    for name in () if unguided else (*by_descriptors, *({"descriptor"} & values.keys())):
+        raise OptionError(f"`{name}` is for --unguided: add that option, or leave `{name}` out")
     chosen, selection = chosen_detector(detector, values, options=DESCRIBED_POINTS)
     matrices = {"homography": homography, "camera0": camera0, "camera1": camera1 or camera0}
     known: dict[str, Any] = {

@@ -368,14 +368,9 @@ class Parallax:
     agreeing: int
     log10_nfa: float
 
-    @property
-    def significant(self) -> bool:
-        """Whether more matches agree on an epipole than chance explains."""
-        return self.log10_nfa < MAX_LOG10_NFA
-
     def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether the parallax is `significant`, and `agreeing` >= this fraction of `on_plane`."""
-        return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
+        """Whether chance does not explain `agreeing`, and it is >= this fraction of `on_plane`."""
+        return self.log10_nfa < MAX_LOG10_NFA and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property
     def shows_depth(self) -> bool:

@@ -127,7 +127,8 @@ class Tracker:
             "scores": np.empty(0, np.float32),
             "ages": np.empty(0, np.int64),
         }
-        self._patches = Patches.none()
+        side = 2 * KEPT_PX + 1
+        self._patches = Patches(np.empty((0, side, side), np.float32), np.empty((0, 2, 2)))
 
     @suggest_keywords
     def update(
@@ -267,11 +268,6 @@ class Patches(NamedTuple):
 
     pixels: np.ndarray
     affinities: np.ndarray
-
-    @classmethod
-    def none(cls) -> Patches:
-        """Return an empty set of patches."""
-        return cls(np.empty((0, 2 * KEPT_PX + 1, 2 * KEPT_PX + 1), np.float32), np.empty((0, 2, 2)))
 
     def select(self, rows: np.ndarray) -> Patches:
         """Return some of the patches; `rows` is a boolean mask or indices."""
