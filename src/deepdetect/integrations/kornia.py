@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from .._shared.errors import OptionError, require_packages
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, unit_length
@@ -90,11 +92,7 @@ class DeepDetectFeature(DeepDetectDetector):
             descriptors of unit length: D is 64 for learned descriptors and 128 for RootSIFT.
         """
         found = _found(self._detector.extract, img, mask)
-        descriptors = [
-            unit_length(points.descriptors)
-            for points in found
-            if points.descriptors is not None  # always true: for the type checker
-        ]
+        descriptors = [unit_length(np.asarray(points.descriptors)) for points in found]
         return *self._frames(found, img), padded(descriptors, img.device)
 
 

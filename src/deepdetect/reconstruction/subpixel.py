@@ -1,9 +1,8 @@
 """Refine matches to sub-pixel accuracy: align the patch around each point to the second image.
 
-The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004), and
-independent of the gain and offset of the brightness. Each patch is aligned twice, first warped by a
-similarity fitted to all matches, then by an affinity fitted to the refined matches around it. On
-Middlebury's Motorcycle, 65 % of the converged matches were accurate to 0.25 px.
+Each patch is aligned twice by `align_patches`, first warped by a similarity fitted to all matches,
+then by an affinity fitted to the refined matches around it. On Middlebury's Motorcycle, 65 % of the
+converged matches were accurate to 0.25 px.
 """
 
 from __future__ import annotations
