@@ -19,9 +19,6 @@ from deepdetect.detector.pretrained import PRETRAINED
 from ..datasets import StereoPair
 from ..datasets.middlebury import load_middlebury
 from ..evaluation.acceptance.measure import FAMILIES, NOTE, guided, measure, summary
-from ..evaluation.acceptance.sensitivity import NOTE as SENSITIVITY_NOTE
-from ..evaluation.acceptance.sensitivity import sensitivity as measure_sensitivity
-from ..evaluation.acceptance.sensitivity import table as sensitivity_table
 from ..evaluation.baselines.external import find_feature, imported
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from ..evaluation.masks import Evaluation, LabelDetector
@@ -192,38 +189,6 @@ def acceptance(
     with atomic_path(folder / "acceptance.csv") as path:
         path.write_text(table.to_csv())
     return cli.Result(table.values(), f"{table.to_markdown()}\n\n{NOTE}")
-
-
-@cli.command()
-def sensitivity(
-    data: Annotated[Path, Parameter(help="Folder of the data sets.")],
-    /,
-    *,
-    family: list[str] | None = None,
-    every: int = 10,
-    output: cli.Output = Path("sensitivity"),
-) -> cli.Result:
-    """Multiply each constant of guided matching by 0.7 and 1.4, and count answers that change.
-
-    Writes a file of answers for each change, and sensitivity.csv. A second run only computes
-    missing answers.
-
-        deepdetect dev sensitivity data --family oxford --family posed -o sensitivity
-
-    Args:
-        family: A family of pairs to match; may be repeated. [default: all]
-        every: Match only every Nth pair of a family.
-        output: Folder for the files.
-    """
-    folder = cli.output_folder(output)
-    for each in family or ():
-        look_up("family", each, FAMILIES)
-    families = family or tuple(FAMILIES)
-    rows = measure_sensitivity(data, folder, families=families, every=every, quiet=False)
-    found = sensitivity_table(rows)
-    with atomic_path(folder / "sensitivity.csv") as path:
-        path.write_text(found.to_csv())
-    return cli.Result(rows, f"{found.to_markdown()}\n\n{SENSITIVITY_NOTE}")
 
 
 OPTIONS = cli.From(BenchmarkOptions, "max_pairs max_images equal_density", more="ranker")
