@@ -21,7 +21,7 @@ from ..datasets.middlebury import load_middlebury
 from ..evaluation.acceptance.measure import FAMILIES, NOTE, guided, measure, summary
 from ..evaluation.baselines.external import find_feature, imported
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
-from ..evaluation.masks import Evaluation, LabelDetector
+from ..evaluation.masks import LabelDetector
 from ..evaluation.masks import evaluate as run
 from ..evaluation.options import BenchmarkOptions
 from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
@@ -61,27 +61,19 @@ def evaluate(
     weights = [values.pop("weights", "default"), *(compare or ())]
     detectors = [DeepDetect(path, **values) for path in weights]
     found = [run(samples, each, scales=tuple(scale or ()), quiet=False) for each in detectors]
-    columns = [
-        {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
-        for detector, evaluation in zip(detectors, found, strict=True)
-    ]
-    report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
-    by_scale = [
-        {f"x{row['scale']:g} {row['visibility']}": row for row in column.get("scales", ())}
-        for column in columns
-    ]
-    text = cli.table(*({**c, "scales": s} for c, s in zip(columns, by_scale, strict=True)))
-    return cli.Result(report, text, list(found[0].failures), what="parts")
-
-
-def _values(evaluation: Evaluation) -> dict[str, Any]:
-    values: dict[str, Any] = {name: asdict(score) for name, score in evaluation.masks.items()}
-    if evaluation.scales:
-        values["scales"] = [
-            {"scale": scale, "visibility": visibility, **asdict(score)}
-            for (scale, visibility), score in evaluation.scales.items()
+    columns, shown = [], []
+    for detector, each in zip(detectors, found, strict=True):
+        masks = {name: asdict(score) for name, score in each.masks.items()}
+        column = {"weights": detector.weights, "backend": detector.runtime, **masks}
+        scales = [
+            {"scale": factor, "visibility": visibility, **asdict(score)}
+            for (factor, visibility), score in each.scales.items()
         ]
-    return values
+        columns.append(column | ({"scales": scales} if scales else {}))
+        by_name = {f"x{row['scale']:g} {row['visibility']}": row for row in scales}
+        shown.append({**column, "scales": by_name})
+    report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
+    return cli.Result(report, cli.table(*shown), list(found[0].failures), what="parts")
 
 
 STEREO_COLUMNS = {
