@@ -171,9 +171,6 @@ class DenseTrainer(Trainer):
             **batches,
         )
 
-    def pixels(self, batch: tuple[Tensor, Tensor]) -> int:
-        return batch[1].numel()
-
     def learning_rate(self, step: int) -> float:
         return self.schedule.learning_rate(step)
 
