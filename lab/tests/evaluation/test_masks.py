@@ -18,7 +18,7 @@ from deepdetect_lab.evaluation.masks import (
     mean_score,
     measure_heatmap,
     sample_images,
-    score_at_scale,
+    scaled_sample,
     score_heatmap,
     score_samples,
 )
@@ -89,14 +89,8 @@ def test_the_calibration_error_is_that_of_the_definition() -> None:
 class Labels:
     """A detector that knows the labels."""
 
-    heatmap_options = HeatmapOptions()
-
     def __init__(self) -> None:
         self.sizes: list[tuple[int, int]] = []
-
-    def configured(self, options: HeatmapOptions) -> Labels:
-        assert options == HeatmapOptions("native")
-        return self
 
     def heatmap(self, rgb: np.ndarray) -> np.ndarray:
         self.sizes.append(rgb.shape[:2])
@@ -107,7 +101,10 @@ def test_a_detector_that_knows_the_labels_has_full_marks(photo: np.ndarray) -> N
     photo = photo[:120, :160]
     dark = (photo * 0.15).astype(np.uint8)
     detector = Labels()
-    rows = [score_at_scale(detector, [photo, dark], scale) for scale in (0.5, 2)]
+    rows = [
+        score_samples(detector.heatmap, [scaled_sample(image, scale) for image in (photo, dark)])
+        for scale in (0.5, 2)
+    ]
     assert [list(row) for row in rows] == [["normal", "low"]] * 2
     height, width = photo.shape[:2]
     assert detector.sizes[0] == (round(height / 2), round(width / 2))
@@ -122,7 +119,7 @@ def test_a_detector_that_knows_the_labels_has_full_marks(photo: np.ndarray) -> N
 @pytest.mark.parametrize("scale", [0.02, 1e-6])
 def test_an_image_must_not_vanish(photo: np.ndarray, scale: float) -> None:
     with pytest.raises(ImageError):
-        score_at_scale(Labels(), [photo], scale)
+        scaled_sample(photo, scale)
 
 
 @pytest.mark.slow
@@ -138,7 +135,8 @@ def test_the_bundled_weights_hold_from_half_to_twice_the_size(
     rows = {}
     for side in (240, 480, 960):
         views = [render(path, View(side, darkening)) for path in photos]
-        rows[side] = score_at_scale(DeepDetect(), views, 1)
+        heatmap = DeepDetect(resolution="native").heatmap
+        rows[side] = score_samples(heatmap, (scaled_sample(view, 1) for view in views))
     for side in (240, 960):
         dark = 0 if darkening is None else 1
         ((visibility, row),) = rows[side].items()

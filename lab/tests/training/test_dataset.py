@@ -26,7 +26,7 @@ from deepdetect_lab.training.dataset import (
     prepare_data,
 )
 from deepdetect_lab.training.recipe import Stage, TrainingOptions
-from deepdetect_lab.training.sampler import CropSampler, Schedule
+from deepdetect_lab.training.sampler import Schedule
 from deepdetect_lab.training.views import (
     SourceImage,
     View,
@@ -90,13 +90,15 @@ def test_an_image_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path
     assert len(list(made.label_folder.glob("*.png"))) == 2 * 2, "the others are kept"
 
 
-def loader(source, options: TrainingOptions = OPTIONS, workers: int = 0, **steps) -> DataLoader:
-    sampler = CropSampler(Schedule(options, len(source)), **steps)
-    return DataLoader(CropDataset(source, options), batch_sampler=sampler, num_workers=workers)
+def loader(
+    source, options: TrainingOptions = OPTIONS, workers: int = 0, first: int = 0
+) -> DataLoader:
+    batches = Schedule(options, len(source)).batches(first)
+    return DataLoader(CropDataset(source, options), batch_sampler=batches, num_workers=workers)
 
 
 def batches(source, options: TrainingOptions = OPTIONS, first: int = 0, last=None) -> list[Batch]:
-    made = loader(source, options, first_step=first)
+    made = loader(source, options, first=first)
     count = None if last is None else last - first
     return [(images.numpy(), masks.numpy()) for images, masks in islice(made, count)]
 
@@ -265,19 +267,6 @@ def test_validation_is_whole_images_first_normal_then_dark(source: FolderSource)
         np.testing.assert_array_equal(rgb, render(image.path, view))
         np.testing.assert_array_equal(mask, label(source, image, view))
         assert isinstance(mask, Tensor)
-
-
-def test_a_view_is_rendered_once(
-    source: FolderSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What was rendered to be labelled is what crops are taken from."""
-    made = FolderSource(source.images[:2], tmp_path, OPTIONS.labels, 2**30)
-    assert made.make_labels([image.normal for image in made.images], workers=1) == 6
-    monkeypatch.setattr("deepdetect_lab.training.dataset.render", None)
-    for index, image in enumerate(made.images):
-        for view in image.normal:
-            for ours, theirs in zip(made.load(index, view), source.load(index, view), strict=True):
-                np.testing.assert_array_equal(ours, theirs)
 
 
 def test_preparation_makes_only_the_labels_that_are_needed(

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +9,11 @@ import torch
 
 from deepdetect import OptionError
 from deepdetect_lab.evaluation.masks import score_heatmap
+from deepdetect_lab.labels import LabelOptions
 from deepdetect_lab.networks.espnet import ESPNet
 from deepdetect_lab.networks.fast import FastNetwork
 from deepdetect_lab.networks.weights import NETWORKS
-from deepdetect_lab.training.dataset import TrainingData
+from deepdetect_lab.training.dataset import FolderSource, TrainingData
 from deepdetect_lab.training.dense import (
     DenseTrainer,
     freeze_batch_norm,
@@ -29,8 +31,8 @@ def make_trainer(
 ) -> DenseTrainer:
     """A trainer of 150 steps without warm-up, at a learning rate of 0.1 falling to nothing."""
     values = {"stages": (Stage(16, 1, 150),), "learning_rate": 0.1, **options}
-    data, recipe = TrainingData([None], [None], ""), plain_options(**values)
-    return DenseTrainer(network, recipe, data, device)
+    source, recipe = FolderSource([None], Path(), LabelOptions()), plain_options(**values)
+    return DenseTrainer(network, recipe, TrainingData(source, source, ""), device)
 
 
 class Constant(torch.nn.Module):

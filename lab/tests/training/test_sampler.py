@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect_lab.training.recipe import Stage
-from deepdetect_lab.training.sampler import CropSampler, Schedule, epoch_order
+from deepdetect_lab.training.sampler import Schedule, epoch_order
 
 from .conftest import plain_options
 
@@ -37,15 +37,14 @@ def test_interleaved_stages_advance_together(photos: int, stages: list[tuple[int
     options = plain_options(stages=made, short_sides=(16,))
     mixed = Schedule(dataclasses.replace(options, interleave=True), photos)
     plain = Schedule(options, photos)
-    positions = [mixed.position(step) for step in range(mixed.steps)]
-    expected = [plain.position(step) for step in range(plain.steps)]
-    key = lambda position: (position.first_epoch, position.sample)  # noqa: E731
-    assert sorted(positions, key=key) == sorted(expected, key=key)
+    batches = list(mixed.batches())
+    assert sorted(batches, key=str) == sorted(plain.batches(), key=str)
     done = [0] * len(made)
     starts = [sum(stage.epochs for stage in made[:k]) for k in range(len(made))]
-    for step, position in enumerate(positions, start=1):
-        number = starts.index(position.first_epoch)
-        assert position.sample == done[number] * position.stage.batch
+    for step, (first, *_) in enumerate(batches, start=1):
+        number = max(k for k, start in enumerate(starts) if start <= first.epoch)
+        sample = (first.epoch - starts[number]) * photos + first.position
+        assert (first.stage, sample) == (made[number], done[number] * made[number].batch)
         done[number] += 1
         for number, total in enumerate(mixed.steps_of_stage):
             assert abs(done[number] - total * step / mixed.steps) < len(made) + 1
@@ -61,9 +60,8 @@ def test_each_image_is_seen_once_an_epoch() -> None:
 
 def test_batches_go_through_the_epochs_of_each_stage() -> None:
     schedule = Schedule(OPTIONS, 10)
-    sampler = CropSampler(schedule)
-    assert len(sampler) == len(list(sampler)) == schedule.steps == 5 + 5
-    crops = [index for batch in sampler for index in batch]
+    assert len(list(schedule.batches())) == schedule.steps == 5 + 5
+    crops = [index for batch in schedule.batches() for index in batch]
     assert [index.epoch for index in crops] == [0] * 10 + [1] * 10 + [2] * 10
     assert [index.stage.crop for index in crops] == [64] * 20 + [32] * 10
     for epoch in range(3):
@@ -72,10 +70,9 @@ def test_batches_go_through_the_epochs_of_each_stage() -> None:
     assert [index.position for index in crops] == 3 * list(range(10))
 
 
-def test_a_sampler_starts_at_any_step() -> None:
+def test_batches_start_at_any_step() -> None:
     schedule = Schedule(OPTIONS, 10)
-    whole = list(CropSampler(schedule))
-    assert list(CropSampler(schedule, first_step=3)) == whole[3:]
+    assert list(schedule.batches(3)) == list(schedule.batches())[3:]
 
 
 @given(sizes=st.lists(st.integers(1, 5), min_size=1, max_size=14), epoch=st.integers(0, 3))

@@ -23,10 +23,6 @@ DEVELOPMENT = {
             "deepdetect_lab.cli.evaluate",
             "Judge a matching engine on image pairs of many kinds.",
         ),
-        "sensitivity": (
-            "deepdetect_lab.cli.evaluate",
-            "Tell which constants of guided matching change its answers.",
-        ),
         "evaluate": ("deepdetect_lab.cli.evaluate", "Score weights on images with known masks."),
         "compare-clouds": (
             "deepdetect_lab.cli.evaluate",

@@ -19,12 +19,9 @@ from deepdetect.detector.pretrained import PRETRAINED
 from ..datasets import StereoPair
 from ..datasets.middlebury import load_middlebury
 from ..evaluation.acceptance.measure import FAMILIES, NOTE, guided, measure, summary
-from ..evaluation.acceptance.sensitivity import NOTE as SENSITIVITY_NOTE
-from ..evaluation.acceptance.sensitivity import sensitivity as measure_sensitivity
-from ..evaluation.acceptance.sensitivity import table as sensitivity_table
 from ..evaluation.baselines.external import find_feature, imported
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
-from ..evaluation.masks import Evaluation, LabelDetector
+from ..evaluation.masks import LabelDetector
 from ..evaluation.masks import evaluate as run
 from ..evaluation.options import BenchmarkOptions
 from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
@@ -64,27 +61,19 @@ def evaluate(
     weights = [values.pop("weights", "default"), *(compare or ())]
     detectors = [DeepDetect(path, **values) for path in weights]
     found = [run(samples, each, scales=tuple(scale or ()), quiet=False) for each in detectors]
-    columns = [
-        {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
-        for detector, evaluation in zip(detectors, found, strict=True)
-    ]
-    report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
-    by_scale = [
-        {f"x{row['scale']:g} {row['visibility']}": row for row in column.get("scales", ())}
-        for column in columns
-    ]
-    text = cli.table(*({**c, "scales": s} for c, s in zip(columns, by_scale, strict=True)))
-    return cli.Result(report, text, list(found[0].failures), what="parts")
-
-
-def _values(evaluation: Evaluation) -> dict[str, Any]:
-    values: dict[str, Any] = {name: asdict(score) for name, score in evaluation.masks.items()}
-    if evaluation.scales:
-        values["scales"] = [
-            {"scale": scale, "visibility": visibility, **asdict(score)}
-            for (scale, visibility), score in evaluation.scales.items()
+    columns, shown = [], []
+    for detector, each in zip(detectors, found, strict=True):
+        masks = {name: asdict(score) for name, score in each.masks.items()}
+        column = {"weights": detector.weights, "backend": detector.runtime, **masks}
+        scales = [
+            {"scale": factor, "visibility": visibility, **asdict(score)}
+            for (factor, visibility), score in each.scales.items()
         ]
-    return values
+        columns.append(column | ({"scales": scales} if scales else {}))
+        by_name = {f"x{row['scale']:g} {row['visibility']}": row for row in scales}
+        shown.append({**column, "scales": by_name})
+    report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
+    return cli.Result(report, cli.table(*shown), list(found[0].failures), what="parts")
 
 
 STEREO_COLUMNS = {
@@ -192,38 +181,6 @@ def acceptance(
     with atomic_path(folder / "acceptance.csv") as path:
         path.write_text(table.to_csv())
     return cli.Result(table.values(), f"{table.to_markdown()}\n\n{NOTE}")
-
-
-@cli.command()
-def sensitivity(
-    data: Annotated[Path, Parameter(help="Folder of the data sets.")],
-    /,
-    *,
-    family: list[str] | None = None,
-    every: int = 10,
-    output: cli.Output = Path("sensitivity"),
-) -> cli.Result:
-    """Multiply each constant of guided matching by 0.7 and 1.4, and count answers that change.
-
-    Writes a file of answers for each change, and sensitivity.csv. A second run only computes
-    missing answers.
-
-        deepdetect dev sensitivity data --family oxford --family posed -o sensitivity
-
-    Args:
-        family: A family of pairs to match; may be repeated. [default: all]
-        every: Match only every Nth pair of a family.
-        output: Folder for the files.
-    """
-    folder = cli.output_folder(output)
-    for each in family or ():
-        look_up("family", each, FAMILIES)
-    families = family or tuple(FAMILIES)
-    rows = measure_sensitivity(data, folder, families=families, every=every, quiet=False)
-    found = sensitivity_table(rows)
-    with atomic_path(folder / "sensitivity.csv") as path:
-        path.write_text(found.to_csv())
-    return cli.Result(rows, f"{found.to_markdown()}\n\n{SENSITIVITY_NOTE}")
 
 
 OPTIONS = cli.From(BenchmarkOptions, "max_pairs max_images equal_density", more="ranker")

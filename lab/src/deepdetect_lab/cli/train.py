@@ -161,7 +161,6 @@ def train(
             "validation_loss": best["validation_loss"],
             "normal": {"loss": best["normal_loss"], "iou": best["normal_iou"]},
             "dark": {"loss": best["dark_loss"], "iou": best["dark_iou"]},
-            "images_per_second": round(result.images_per_second, 3),
         }
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +94,10 @@ CERTAIN_LOGIT = 200.0
 """The sigmoid of this logit is exactly 1 in float32, and the sigmoid of its negative is 0."""
 
 
+Sample = tuple[np.ndarray, np.ndarray, str]
+"""An image, (H, W, 3) uint8 RGB, its mask, (H, W) bool, and its visibility, "normal" or "low"."""
+
+
 def sample_images(folder: str | Path) -> list[Path]:
     """List the images `image_*.png` in a folder that also holds their masks `mask_image_*.png`.
 
@@ -108,8 +113,8 @@ def sample_images(folder: str | Path) -> list[Path]:
     return images
 
 
-def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Load an image, (H, W, 3) uint8 RGB, and the mask beside it, (H, W) bool.
+def load_sample(path: Path) -> Sample:
+    """Load an image and the mask beside it.
 
     Raises:
         ImageError: a file is missing or damaged, or the mask has another size.
@@ -118,55 +123,34 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
     mask = load_mask(path.with_name(f"mask_{path.name}"))
     if mask.shape != rgb.shape[:2]:
         raise ImageError(f"the image {path} and its mask differ in size")
-    return rgb, mask
+    return rgb, mask, visibility_of(luma(rgb))
+
+
+def scaled_sample(image: Path | np.ndarray, scale: float) -> Sample:
+    """Scale an image by a factor; its mask is the label that `fuse` makes of the scaled image.
+
+    Raises:
+        ImageError: the scaled image has a side of under 16 pixels.
+    """
+    rgb = load_image(image)
+    if (side := round(scale * min(rgb.shape[:2]))) < MINIMUM_SIDE:
+        raise ImageError(
+            f"{image.name if isinstance(image, Path) else 'an image'} scaled by {scale:g} has a "
+            f"side of {side} pixels, but at least {MINIMUM_SIDE} are needed: use larger scales"
+        )
+    rgb = scale_short_side(rgb, side)
+    label = fuse(luma(rgb))
+    return rgb, label.mask, label.visibility
 
 
 def score_samples(
-    heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
+    heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[Sample]
 ) -> dict[str, MaskScore]:
-    """Compare a function's heat maps with the images' masks; return the scores by visibility."""
-    return _by_visibility(
-        (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
-    )
-
-
-def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScore]:
+    """Compare a function's heat maps with the masks; return a score for each visibility."""
     measured: dict[str, list[Measured]] = {"normal": [], "low": []}
-    for visibility, one in images:
-        measured[visibility].append(one)
+    for rgb, mask, visibility in samples:
+        measured[visibility].append(measure_heatmap(heatmap(rgb), mask))
     return {name: mean_score(listed) for name, listed in measured.items() if listed}
-
-
-def check_scale(image: np.ndarray, scale: float, name: str = "an image") -> None:
-    """Raise an ImageError if the image scaled by this factor has a side of under 16 pixels."""
-    if (side := round(scale * min(image.shape[:2]))) < MINIMUM_SIDE:
-        raise ImageError(
-            f"{name} scaled by {scale:g} has a side of {side} pixels, "
-            f"but at least {MINIMUM_SIDE} are needed: use larger scales"
-        )
-
-
-def score_at_scale(
-    detector: DeepDetect, images: Iterable[np.ndarray], scale: float
-) -> dict[str, MaskScore]:
-    """Scale (H, W, 3) images; score the weights by labels that `fuse` makes of the scaled images.
-
-    The network processes images at their scaled size. Returns a score for each visibility that
-    occurs, "normal" or "low".
-
-    Raises:
-        ImageError: a scaled image has a side of under 16 pixels.
-    """
-    native = detector.configured(replace(detector.heatmap_options, resolution="native"))
-
-    def measured() -> Iterator[tuple[str, Measured]]:
-        for image in images:
-            check_scale(image, scale)
-            rgb = scale_short_side(image, round(scale * min(image.shape[:2])))
-            label = fuse(luma(rgb))
-            yield label.visibility, measure_heatmap(native.heatmap(rgb), label.mask)
-
-    return _by_visibility(measured())
 
 
 @dataclass(frozen=True)
@@ -220,26 +204,25 @@ def evaluate(
     if not all(0 < scale < math.inf for scale in scales):
         raise OptionError(f"scales must be numbers above 0, not {list(scales)}")
     detector = DeepDetect() if detector is None else detector
+    native = detector.configured(replace(detector.heatmap_options, resolution="native"))
     failures: dict[str, None] = {}
     with_masks = not scales or any(Path(samples).glob("mask_image_*.png"))
     images = sample_images(samples) if with_masks else find_images(samples)
 
-    def loaded(title: str, scale: float = 1) -> Iterator[tuple[Any, Any]]:
+    def loaded(title: str, load: Callable[[Path], Sample]) -> Iterator[Sample]:
         with progress(len(images), title, "image", quiet) as bar:
             for path in images:
                 try:
-                    sample = load_sample(path) if with_masks else (load_image(path), None)
-                    check_scale(sample[0], scale, path.name)
-                    yield sample
+                    yield load(path)
                 except ImageError as error:
                     failures[str(error)] = None
                 bar.update(1)
 
-    masks = score_samples(detector.heatmap, loaded("scoring")) if with_masks else {}
+    masks = score_samples(detector.heatmap, loaded("scoring", load_sample)) if with_masks else {}
     by_scale: dict[tuple[float, str], MaskScore] = {}
     for scale in scales:
-        shown = (rgb for rgb, _ in loaded(f"scale {scale:g}", scale))
-        for visibility, score in score_at_scale(detector, shown, scale).items():
+        scaled = loaded(f"scale {scale:g}", partial(scaled_sample, scale=scale))
+        for visibility, score in score_samples(native.heatmap, scaled).items():
             by_scale[scale, visibility] = score
     if not masks and not by_scale:
         raise ImageError(next(iter(failures)))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from skimage.util import montage
 
 from deepdetect._shared.errors import DeepDetectError, MissingExtraError
 from deepdetect._shared.image_array import Channels, check_channels
@@ -168,11 +169,7 @@ def label_file(task: LabelTask) -> dict[str, Any] | str:
 
 def join_pictures(panels: Sequence[np.ndarray], columns: int, gap_px: int = 6) -> np.ndarray:
     """Join images of one size in a grid of `columns` columns, with white gaps."""
-    height, width = panels[0].shape[:2]
-    rows = -(-len(panels) // columns)
-    size = rows * (height + gap_px) - gap_px, columns * (width + gap_px) - gap_px, 3
-    joined = np.full(size, 255, np.uint8)
-    for k, panel in enumerate(panels):
-        top, left = k // columns * (height + gap_px), k % columns * (width + gap_px)
-        joined[top : top + height, left : left + width] = panel
-    return joined
+    shape = -(-len(panels) // columns), columns
+    white = {"fill": (255,) * 3, "padding_width": gap_px, "channel_axis": -1}
+    joined: np.ndarray = montage(np.stack(panels), grid_shape=shape, **white)
+    return joined[gap_px:-gap_px, gap_px:-gap_px]

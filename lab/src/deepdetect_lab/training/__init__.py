@@ -1,7 +1,7 @@
 """Training of the detector, the keypoint ranker, the learned descriptor and the match filter.
 
 To train the detector, `train` scales images to views, labels the views, and cuts random crops from
-them. A `CropDataset` and a seeded `CropSampler` make the batches of a torch `DataLoader`.
+them. A `CropDataset` and a seeded `Schedule` make the batches of a torch `DataLoader`.
 """
 
 import lazy_loader

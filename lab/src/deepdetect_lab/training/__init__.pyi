@@ -1,4 +1,3 @@
-from .dataset import CropDataset as CropDataset, ValidationDataset as ValidationDataset
 from .recipe import (
     PRESETS as PRESETS,
     DescriptorTrainingOptions as DescriptorTrainingOptions,
@@ -12,6 +11,5 @@ from .run import (
     train as train,
     train_on_pairs as train_on_pairs,
 )
-from .sampler import CropSampler as CropSampler, Schedule as Schedule
 from .shards import write_shards as write_shards
 from .trainer import TrainingResult as TrainingResult

@@ -82,13 +82,10 @@ class FolderSource:
                 f"the label of {source.path} does not have the size of its view: delete the "
                 f"folder of labels {self.label_folder}"
             )
-        self._keep(index, view, image, mask)
-        return image, mask
-
-    def _keep(self, index: int, view: View, image: np.ndarray, mask: np.ndarray) -> None:
         if image.nbytes + mask.nbytes <= self.memory_bytes:
             self.memory_bytes -= image.nbytes + mask.nbytes
             self._kept[index, view] = image, mask
+        return image, mask
 
     def make_labels(
         self, views: Sequence[tuple[View, ...]], workers: int | None = None, quiet: bool = True
@@ -98,21 +95,18 @@ class FolderSource:
         Raises:
             BatchError: some images cannot be read. The labels of all other images are made.
         """
-        tasks, memory = [], self.memory_bytes
-        for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
+        tasks: list[LabelTask] = []
+        for image, needed in zip(self.images, views, strict=True):
             files = {view: self.label_path(image, view) for view in needed}
             if missing := {view: path for view, path in files.items() if not path.exists()}:
-                memory -= sum(4 * view.short_side**2 for view in missing)  # lower bound in bytes
-                tasks.append((index, image.path, missing, memory > 0))
-        total = sum(len(missing) for _, _, missing, _ in tasks)
-        failures = []
+                tasks.append((image.path, missing))
+        total = sum(len(missing) for _, missing in tasks)
+        failures: list[str] = []
         work = partial(_make_labels, options=self.label_options)
         with progress(total, "labels", "label", quiet) as bar:
-            for (index, _, missing, _), made, error in map_in_processes(work, tasks, workers):
-                for view, pair in made.items():
-                    self._keep(index, view, *pair)
-                failures += [error] if error else []
-                bar.update(len(missing))
+            for count, failed in map_in_processes(work, tasks, workers):
+                failures += failed
+                bar.update(count)
         if failures:
             raise BatchError(
                 f"{len(failures)} of {len(self.images)} images cannot be read (the labels of the "
@@ -122,35 +116,27 @@ class FolderSource:
         return total
 
 
-LabelTask = tuple[int, Path, dict[View, Path], bool]
-"""The work on one image: its index and file, the label file to write for each view, and whether
-`_make_labels` returns the rendered views."""
+LabelTask = tuple[Path, dict[View, Path]]
+"""The work on one image: its file, and the label file to write for each view."""
 
 
-def _make_labels(
-    task: LabelTask, options: LabelOptions
-) -> tuple[LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
-    """Write the labels; return the task, the (image, label) of each view, and an error or ""."""
-    _, file, labels, keep = task
-    made = {}
+def _make_labels(task: LabelTask, options: LabelOptions) -> tuple[int, list[str]]:
+    """Write the labels of an image; return their number, and an error if it cannot be read."""
+    file, labels = task
     try:
         image = load_image(file)
         for view, path in labels.items():
-            rgb = render(image, view)
-            mask = label_view(rgb, view, options)
-            save_mask(mask, path)
-            if keep:
-                made[view] = rgb, mask
+            save_mask(label_view(render(image, view), view, options), path)
     except ImageError as error:
-        return task, made, str(error)
-    return task, made, ""
+        return len(labels), [str(error)]
+    return len(labels), []
 
 
 ImageSource = FolderSource | ShardSource
 
 
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Random augmented crops of views, indexed by the `CropIndex` entries of a `CropSampler`.
+    """Random augmented crops of views, indexed by the `CropIndex` entries of a `Schedule`.
 
     An item is a cropped image, (crop, crop, 3) uint8 RGB, and its label, (crop, crop) bool. All
     random choices depend only on the index and the seed of the options.

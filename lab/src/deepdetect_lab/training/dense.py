@@ -33,10 +33,14 @@ from ..networks.weights import (
 from .dataset import CropDataset, TrainingData, ValidationDataset, loading
 from .optim import make_optimizers
 from .recipe import DeviceOptions, InitWeights, TrainingOptions
-from .sampler import CropSampler, Schedule, milestones
+from .sampler import Schedule, milestones
 from .trainer import Trainer, seeded
 
 ONNX = "deepdetect.onnx"
+COMPILING = (
+    "the first step of each stage compiles the network, which takes minutes on two cores; with "
+    "--no-compile, training starts at once, but each step takes longer"
+)
 
 
 def initial_network(
@@ -110,18 +114,13 @@ class DenseTrainer(Trainer):
         self.compiled = has_compiler if device.compile is None else device.compile
         self._forward = self._set_up()
         self.optimizers = make_optimizers(options.optimizer, network)
-        self.schedule = Schedule(options, len(data.training))
+        self.schedule = Schedule(options, len(data.training), data.training.shard_sizes)
         self.steps = self.schedule.steps
         self.milestones = milestones(self.steps, options.val_count)
         self.origin = {"images_digest": data.digest, "initial_weights": initial_weights}
         how = self.describe()
         self.notes = {"images": str(len(data.training)), "run_on": how}
-        self.introduction = [f"training on {how}"]
-        if self.compiled:
-            self.introduction.append(
-                "the first step of each stage compiles the network, which takes minutes on two "
-                "cores; with --no-compile, training starts at once, but each step takes longer"
-            )
+        self.introduction = [f"training on {how}", *([COMPILING] if self.compiled else [])]
 
     def _set_up(self) -> nn.Module:
         if not self.compiled:
@@ -159,8 +158,8 @@ class DenseTrainer(Trainer):
 
     def loader(self, first: int = 0) -> DataLoader[Any]:
         """Return a loader of the batches (images, labels) from step `first` on."""
-        sampler = CropSampler(self.schedule, self.data.training.shard_sizes, first)
-        return self._loader(CropDataset(self.data.training, self.options), batch_sampler=sampler)
+        dataset = CropDataset(self.data.training, self.options)
+        return self._loader(dataset, batch_sampler=self.schedule.batches(first))
 
     def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:
         return DataLoader(
@@ -171,9 +170,6 @@ class DenseTrainer(Trainer):
             generator=torch.Generator(),
             **batches,
         )
-
-    def pixels(self, batch: tuple[Tensor, Tensor]) -> int:
-        return batch[1].numel()
 
     def learning_rate(self, step: int) -> float:
         return self.schedule.learning_rate(step)

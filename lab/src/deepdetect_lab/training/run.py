@@ -117,7 +117,7 @@ def train_on_pairs(
             safetensors and an ONNX file otherwise), MODEL_CARD.md and the training curves.
         options: the recipe.
         init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file,
-            or with `crops` also EdgePoint2's L64.pth. None: random, from the seed.
+            or EdgePoint2's L64.pth. None: random, from the seed.
         readings: folder written by `deepdetect dev read-teachers`, for a descriptor with `crops`.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
         num_workers: number of processes that generate pairs; with 0, the training process does it.
@@ -144,16 +144,13 @@ def train_on_pairs(
     where = DeviceOptions(device=device, num_workers=num_workers)
     files = _files(images, validation, output)
     trainer: Trainer
-    if isinstance(options, DescriptorTrainingOptions) and options.crops:
-        from .descriptor.taught_task import TaughtTrainer
-
-        if readings is None:
-            raise OptionError("`crops` need `readings`, the folder that `read-teachers` wrote")
-        trainer = TaughtTrainer(*files, options, init_weights, where, Path(readings))
-    elif isinstance(options, DescriptorTrainingOptions):
+    if isinstance(options, DescriptorTrainingOptions):
         from .descriptor.task import DescriptorTrainer
 
-        trainer = DescriptorTrainer(*files, options, init_weights, where)
+        if options.crops and readings is None:
+            raise OptionError("`crops` need `readings`, the folder that `read-teachers` wrote")
+        of_teachers = Path(readings) if readings is not None and options.crops else None
+        trainer = DescriptorTrainer(*files, options, init_weights, where, of_teachers)
     elif isinstance(options, PointsTrainingOptions):
         from .points.task import RankerTrainer
 

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from torch.utils.data import Sampler
 
 from .recipe import Stage, TrainingOptions
 
@@ -28,20 +27,27 @@ class CropIndex(NamedTuple):
     stage: Stage
 
 
-class Position(NamedTuple):
-    """A step's stage, the index in it of the step's first crop, and the stage's first epoch."""
-
-    stage: Stage
-    sample: int
-    first_epoch: int
-
-
 class Schedule:
-    """The steps of a run: their stages, batches and learning rates, for a number of images."""
+    """The steps of a run: their stages, batches and learning rates.
 
-    def __init__(self, options: TrainingOptions, images: int) -> None:
+    Args:
+        options: the recipe.
+        images: number of images.
+        shard_sizes: number of images in each shard; images of only a few shards are mixed at a
+            time. None: the images are not in shards, and are all mixed.
+
+    Example:
+        >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
+        >>> [[index.image for index in batch] for batch in schedule.batches()]
+        [[3, 0], [2, 1]]
+    """
+
+    def __init__(
+        self, options: TrainingOptions, images: int, shard_sizes: Sequence[int] | None = None
+    ) -> None:
         self.options = options
         self.images = images
+        self.shard_sizes = None if shard_sizes is None else tuple(shard_sizes)
         self.steps_of_stage = [
             max(1, stage.epochs * images // stage.batch) for stage in options.stages
         ]
@@ -56,12 +62,23 @@ class Schedule:
         batches = np.array([stage.batch for stage in options.stages])
         self._crops = np.concatenate([[0], np.cumsum(batches[self._stages])])
 
-    def position(self, step: int) -> Position:
-        """Find the stage of a step, and where in the stage the step begins."""
+    def batches(self, first: int = 0) -> Iterator[list[CropIndex]]:
+        """Return an iterator over the batches from step `first` on, for a torch `DataLoader`."""
+        return map(self.batch, range(first, self.steps))
+
+    def batch(self, step: int) -> list[CropIndex]:
+        """Return the crops of a step."""
         number = int(self._stages[step])
         stage = self.options.stages[number]
         first_epoch = sum(each.epochs for each in self.options.stages[:number])
-        return Position(stage, int(self._within[step]) * stage.batch, first_epoch)
+        start = int(self._within[step]) * stage.batch
+        batch = []
+        for sample in range(start, start + stage.batch):
+            epoch, place = divmod(sample, self.images)
+            epoch += first_epoch
+            order = epoch_order(self.options.seed, epoch, self.images, self.shard_sizes)
+            batch.append(CropIndex(int(order[place]), epoch, place, stage))
+        return batch
 
     def learning_rate(self, step: int) -> float:
         """Return the learning rate of a step: a linear warm-up into cosine annealing."""
@@ -78,50 +95,6 @@ class Schedule:
 def milestones(steps: int, count: int) -> set[int]:
     """Return the steps after which to validate: `count` evenly spaced ones, including the last."""
     return {round(steps * part / count) for part in range(1, count + 1)} - {0}
-
-
-class CropSampler(Sampler[list[CropIndex]]):
-    """The batches of consecutive steps, a batch sampler for `torch.utils.data.DataLoader`.
-
-    Args:
-        schedule: the steps.
-        shard_sizes: number of images in each shard; images of only a few shards are mixed at a
-            time. None: the images are not in shards, and are all mixed.
-        first_step: number of the first step to make batches for. All later steps follow.
-
-    Example:
-        >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
-        >>> [[index.image for index in batch] for batch in CropSampler(schedule)]
-        [[3, 0], [2, 1]]
-    """
-
-    def __init__(
-        self,
-        schedule: Schedule,
-        shard_sizes: Sequence[int] | None = None,
-        first_step: int = 0,
-    ) -> None:
-        self.schedule = schedule
-        self.shard_sizes = None if shard_sizes is None else tuple(shard_sizes)
-        self.steps = range(first_step, schedule.steps)
-
-    def __len__(self) -> int:
-        return len(self.steps)
-
-    def __iter__(self) -> Iterator[list[CropIndex]]:
-        return map(self.batch, self.steps)
-
-    def batch(self, step: int) -> list[CropIndex]:
-        """Return the crops of a step."""
-        position, count = self.schedule.position(step), self.schedule.images
-        stage = position.stage
-        batch = []
-        for sample in range(stage.batch):
-            epoch, place = divmod(position.sample + sample, count)
-            epoch += position.first_epoch
-            order = epoch_order(self.schedule.options.seed, epoch, count, self.shard_sizes)
-            batch.append(CropIndex(int(order[place]), epoch, place, stage))
-        return batch
 
 
 @functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs

@@ -33,7 +33,6 @@ Network = TypeVar("Network", bound=nn.Module)
 
 CHECKPOINT = "checkpoint.safetensors"
 CARD = "MODEL_CARD.md"
-FULL_IMAGE_PIXELS = 480 * 480
 
 CHECKPOINT_INTERVAL_S = 60.0
 """Seconds between checkpoints: a killed run loses about this time at most. Chosen by hand."""
@@ -61,14 +60,12 @@ class TrainingResult:
         onnx: ONNX file with the same weights; None for a ranker.
         points: points of the training curves: losses and measures by name, for each validation.
         best: the point of the best weights.
-        images_per_second: mean speed, in images of 480x480 pixels; 0 for training on pairs.
     """
 
     weights: Path
     onnx: Path | None
     points: list[Point]
     best: Point
-    images_per_second: float
 
 
 class Trainer(abc.ABC):
@@ -114,10 +111,6 @@ class Trainer(abc.ABC):
     @abc.abstractmethod
     def loader(self, first: int = 0) -> DataLoader[Any]:
         """Return a loader of the batches from step `first` to the last step."""
-
-    def pixels(self, batch: Any) -> int:
-        """Return the number of pixels in a batch, to compute the speed; with 0, none is shown."""
-        return 0
 
     @abc.abstractmethod
     def learning_rate(self, step: int) -> float:
@@ -189,20 +182,15 @@ class Trainer(abc.ABC):
         measured = {point["step"] for point in state.points}
         if state.step in self.milestones and state.step not in measured:
             self._validate(state, folder)  # before step 0, or if this validation was interrupted
-        started, pixels = time.monotonic(), 0
-        saved = started
+        saved = time.monotonic()
         bar = progress(self.steps, "training", "step", log is None, state.step)
         with bar, loading(self.loader(state.step)) as batches:
             for batch in batches:
                 state.loss_sum += self.training_step(batch, state.step)
                 state.loss_count += 1
                 state.step += 1
-                pixels += self.pixels(batch)
                 bar.update(1)
                 text = f"loss {state.loss_sum / state.loss_count:.4f}"
-                if pixels:
-                    speed = pixels / FULL_IMAGE_PIXELS / (time.monotonic() - started)
-                    text += f", {speed:.1f} images/s"
                 if state.points:
                     text += f", best {self._best(state)[self.objective]:.4f}"
                 bar.set_postfix_str(text, False)
@@ -212,11 +200,10 @@ class Trainer(abc.ABC):
                 if time.monotonic() - saved >= CHECKPOINT_INTERVAL_S:
                     self._save(state, folder)
                     saved = time.monotonic()
-        speed = pixels / FULL_IMAGE_PIXELS / max(time.monotonic() - started, 1e-9)
         best, weights = self._best(state), folder / self.weights_file
         onnx = self.export(folder)
         self._write_card(folder, state.points, best)
-        return TrainingResult(weights, onnx, state.points, best, speed)
+        return TrainingResult(weights, onnx, state.points, best)
 
     def _best(self, state: TrainingState) -> Point:
         return min(state.points, key=lambda point: self.sign * point[self.objective])

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,9 @@ from deepdetect_lab.training import (
     train_on_pairs,
 )
 from deepdetect_lab.training.checkpoint import read_checkpoint
+from deepdetect_lab.training.descriptor.export import export_descriptor
 from deepdetect_lab.training.descriptor.losses import KINDS, shares_right
-from deepdetect_lab.training.descriptor.network import DescriptorNetwork
+from deepdetect_lab.training.descriptor.network import BACKBONE, DescriptorNetwork
 from deepdetect_lab.training.descriptor.task import (
     DescriptorTrainer,
     draw_numbered,
@@ -39,14 +41,17 @@ from deepdetect_lab.training.trainer import CHECKPOINT
 OPTIONS = DescriptorTrainingOptions(steps=3, pairs=2, val_count=1, val_pairs=1)
 
 
-def run(textures: Path, folder: Path, **how: Any) -> TrainingResult:
-    return train_on_pairs(textures, textures, folder, OPTIONS, device="cpu", **how)
+def run(
+    textures: Path, folder: Path, options: DescriptorTrainingOptions = OPTIONS, **how: Any
+) -> TrainingResult:
+    return train_on_pairs(textures, textures, folder, options, device="cpu", **how)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def checkpoints_at_every_step() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("deepdetect_lab.training.trainer.CHECKPOINT_INTERVAL_S", 0)
+        patch.setattr("deepdetect_lab.training.descriptor.task.VAL_CROPS", 1)
         yield
 
 
@@ -60,16 +65,30 @@ def test_training_changes_the_weights_and_measures(whole: TrainingResult) -> Non
     with torch.random.fork_rng():
         torch.manual_seed(0)
         before = DescriptorNetwork()
-    assert all((after[f"network.{n}"] != p).any() for n, p in before.named_parameters())
+    kept = [n for n, p in before.named_parameters() if (after[f"network.{n}"] == p).all()]
+    assert kept
+    assert all(name.startswith(("score", "teach")) for name in kept)  # only teachers need these
     assert [point["step"] for point in whole.points] == [3]
     shares = [whole.best[f"{kind} correct"] for kind in KINDS]
     assert whole.best["score"] == pytest.approx(np.mean(shares))
     assert (whole.weights.parent / "MODEL_CARD.md").is_file()
 
 
+@pytest.mark.parametrize("crops", [0, 1])
 def test_an_interrupted_run_ends_with_the_same_weights(
-    whole: TrainingResult, textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    crops: int,
+    whole: TrainingResult,
+    textures: Path,
+    made_readings: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    how: Any = {"options": replace(OPTIONS, crops=crops), "readings": made_readings}
+    if crops:
+        whole = run(textures, tmp_path / "whole", **how)
+        counted = [f"{kind} correct" for kind in KINDS] + ["teachers score", "teachers found"]
+        assert whole.best["score"] == pytest.approx(np.mean([whole.best[name] for name in counted]))
+        assert "MIT" in (tmp_path / "whole/MODEL_CARD.md").read_text("utf-8")
     calls, step = iter(range(2)), DescriptorTrainer.training_step
 
     def training_step(*arguments: Any) -> float:
@@ -80,9 +99,9 @@ def test_an_interrupted_run_ends_with_the_same_weights(
     with monkeypatch.context() as patch:
         patch.setattr(DescriptorTrainer, "training_step", training_step)
         with pytest.raises(KeyboardInterrupt):
-            run(textures, tmp_path)
+            run(textures, tmp_path, **how)
     assert read_checkpoint(tmp_path / CHECKPOINT)[1]["step"] == 2
-    assert run(textures, tmp_path).points == whole.points
+    assert run(textures, tmp_path, **how).points == whole.points
     first, second = (load_file(folder / CHECKPOINT) for folder in (tmp_path, whole.weights.parent))
     assert first.keys() == second.keys()
     assert all(torch.equal(first[name], second[name]) for name in first)
@@ -97,20 +116,6 @@ def test_the_files_hold_the_weights_that_were_measured(
     notes = read_notes(whole.weights)
     assert (notes["images"], notes["run_on"]) == ("4", "cpu")
     assert json.loads(notes["point"]) == whole.best
-
-
-def test_the_onnx_file_describes_as_the_network(whole: TrainingResult) -> None:
-    network: Any = load_network(whole.weights, DescriptorNetwork)
-    rng = np.random.default_rng(2)
-    luma = rng.random((1, 1, 256, 384), dtype=np.float32)
-    xy = (rng.random((1, 70, 2)) * (384, 256) - 0.5).astype(np.float32)
-    sizes = rng.uniform(2, 40, (1, 70)).astype(np.float32)
-    session = onnxruntime.InferenceSession(whole.onnx, providers=["CPUExecutionProvider"])
-    found = session.run(None, {"luma": luma, "xy": xy, "sizes": sizes})[0]
-    with torch.no_grad():
-        expected = network(*map(torch.from_numpy, (luma, xy, sizes))).numpy()
-    np.testing.assert_allclose(found, expected, atol=5e-3)  # kernels are float16 there
-    assert np.abs(expected[0] - expected[0, :1]).max() > 0.05
 
 
 def test_own_weights_describe_points_and_are_of_their_own_type(
@@ -163,3 +168,58 @@ def test_images_without_detail_are_refused(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("deepdetect_lab.training.scenes.ATTEMPTS", 1)
     with pytest.raises(OptionError, match="detail"):
         draw_numbered([tmp_path / "grey.png"], 2)
+
+
+def test_crops_need_readings(textures: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="need `readings`"):
+        run(textures, tmp_path, replace(OPTIONS, crops=1))
+
+
+def test_a_run_starts_from_the_published_layers(
+    textures: Path, made_readings: Path, l64: Path
+) -> None:
+    images = find_images(textures)
+    where = DeviceOptions(device="cpu")
+    trainer = DescriptorTrainer(
+        images, images, replace(OPTIONS, crops=1), l64, where, made_readings
+    )
+    expected = DescriptorNetwork()
+    expected.start_from(l64)
+    started = [name for name, _ in expected.named_parameters() if name.startswith(BACKBONE)]
+    for name in started:
+        assert torch.equal(trainer.network.get_parameter(name), expected.get_parameter(name))
+    rates = {
+        parameter: group["rate_factor"]
+        for optimizer in trainer.optimizers
+        for group in optimizer.param_groups
+        for parameter in group["params"]
+    }
+    names = "block_eighth.first.weight", "input.weight", "at_half.weight", "input.bias"
+    found = [rates[trainer.network.get_parameter(name)] for name in names]
+    assert found == [0.5, 1, 0.2, 0.4]
+    trainer.steps = 1000
+    rate = trainer.options.learning_rate
+    found = [trainer.learning_rate(step) / rate for step in (0, 160, 590, 1000)]
+    assert found == pytest.approx([1 / 150, 1, 0.5, 0])
+
+
+def test_an_onnx_file_gives_the_same_numbers(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = DescriptorNetwork()
+    with torch.no_grad():
+        for norm in (network.norm, network.middle_norm):
+            for values in (norm.weight, norm.bias, norm.running_mean, norm.running_var):
+                assert values is not None
+                values.uniform_(0.5, 2)
+    network.eval()
+    export_descriptor(network, tmp_path / "descriptor.onnx")
+    session = onnxruntime.InferenceSession(
+        tmp_path / "descriptor.onnx", providers=["CPUExecutionProvider"]
+    )
+    luma, xy, sizes = torch.rand(1, 1, 256, 256), torch.rand(1, 40, 2) * 255, torch.rand(1, 40) * 30
+    with torch.no_grad():
+        expected = network(luma, xy, sizes)
+    inputs = {"luma": luma.numpy(), "xy": xy.numpy(), "sizes": sizes.numpy()}
+    (found,) = session.run(None, inputs)
+    np.testing.assert_allclose(found, expected.numpy(), atol=5e-3)  # kernels are float16
+    assert expected.shape == (1, 40, 64)

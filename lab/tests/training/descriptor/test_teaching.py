@@ -9,8 +9,8 @@ import torch
 from deepdetect.io.image import find_images
 from deepdetect_lab.training.descriptor import teaching
 from deepdetect_lab.training.descriptor.crops import Crops, draw_crops
-from deepdetect_lab.training.descriptor.edge import EdgeNetwork
 from deepdetect_lab.training.descriptor.losses import contrastive_loss
+from deepdetect_lab.training.descriptor.network import DescriptorNetwork
 from deepdetect_lab.training.descriptor.task import draw_numbered, stack
 from deepdetect_lab.training.descriptor.teaching import (
     crop_losses,
@@ -33,13 +33,13 @@ def pairs(textures: Path) -> Pair:
 
 
 @pytest.fixture
-def network() -> EdgeNetwork:
+def network() -> DescriptorNetwork:
     torch.manual_seed(0)
-    return EdgeNetwork()
+    return DescriptorNetwork()
 
 
 def test_a_perfect_pupil_has_no_loss(
-    network: EdgeNetwork, crops: Crops, monkeypatch: pytest.MonkeyPatch
+    network: DescriptorNetwork, crops: Crops, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(teaching, "turn", lambda code, angles: code)
     monkeypatch.setattr(network, "code", lambda features, xy: crops.codes)
@@ -58,7 +58,9 @@ def test_a_perfect_pupil_has_no_loss(
     assert measures["order score"] == pytest.approx(1, abs=1e-2)
 
 
-def test_all_losses_reach_the_weights(network: EdgeNetwork, crops: Crops, pairs: Pair) -> None:
+def test_all_losses_reach_the_weights(
+    network: DescriptorNetwork, crops: Crops, pairs: Pair
+) -> None:
     losses = crop_losses(network, crops)
     assert sorted(losses) == ["codes", "neighbours", "own neighbours", "relations", "survival"]
     of_pairs = contrastive_loss(network, pairs, np.random.default_rng(0))

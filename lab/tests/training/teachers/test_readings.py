@@ -115,7 +115,7 @@ def test_the_commands_read_and_learn(
     values = json.loads(done.stdout)
     assert (values["read"], values["skipped"]) == (4, 0)
     assert values["points"] > 1000
-    monkeypatch.setattr("deepdetect_lab.training.descriptor.taught_task.VAL_CROPS", 1)
+    monkeypatch.setattr("deepdetect_lab.training.descriptor.task.VAL_CROPS", 1)
     learning = ["train-descriptor", textures, "--validation", textures, "-o", "taught"]
     options = ["--crops", "1", "--readings", "readings", "--steps", "1", "--pairs", "1"]
     counts = ["--val-count", "1", "--val-pairs", "1", "--device", "cpu", "--json"]

@@ -133,6 +133,8 @@ def answer(pair: JudgedPair, engine: Engine, seed: int) -> Row:
     seconds = time.process_time() - started
     geometry = matches.geometry
     correct = pair.truth.correct(matches.points0, matches.points1)
+    error = pair.truth.pose_error(matches.points0, matches.points1)
+    marked = pair.correspondences
     return {
         "kind": pair.kind,
         "pair": pair.name,
@@ -143,16 +145,10 @@ def answer(pair: JudgedPair, engine: Engine, seed: int) -> Row:
         "scene": "none" if geometry is None else geometry.scene,
         "matches": len(matches),
         "precision": float(correct.mean()) if len(correct) else None,
-        "pose error": _finite(pair.truth.pose_error(matches.points0, matches.points1)),
-        "accuracy": None
-        if pair.correspondences is None
-        else _accuracy(matches, pair.correspondences),
+        "pose error": None if error is None else min(error, 180.0),  # infinite without a pose
+        "accuracy": None if marked is None else _accuracy(matches, marked),
         "seconds": seconds,
     }
-
-
-def _finite(error: float | None) -> float | None:
-    return 180.0 if error == float("inf") else error
 
 
 def _accuracy(matches: Matches, places: np.ndarray) -> float:

@@ -7,7 +7,7 @@ within the family.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 
@@ -90,12 +90,11 @@ def planes(data: Path) -> Iterator[JudgedPair]:
         rest = "a scene with depth" if rectified else "unrelated"
         images, homography, mask = _plane(photographs, number, share, rectified)
         truth = Truth(homography, mask, ROWS if rectified else None)
-        kind = f"plane of {share:.0%}, the rest {rest}"
-        yield JudgedPair(kind, str(number), partial(_given, images), truth)
+        yield _made(f"plane of {share:.0%}, the rest {rest}", number, images, truth)
 
 
-def _given(images: Images) -> Images:
-    return images
+def _made(kind: str, number: int, images: Images, truth: Truth) -> JudgedPair:
+    return JudgedPair(kind, str(number), lambda: images, truth)
 
 
 def _plane(
@@ -136,8 +135,7 @@ def facades(data: Path) -> Iterator[JudgedPair]:
         which, tilted = number % 3, number % 9 >= 6
         images, homography = _facade(photographs, number, which, 0.2 if tilted else 0.05)
         kind = f"{kinds[which]}{', tilted' if tilted else ''}"
-        truth = Truth(homography)
-        yield JudgedPair(kind, str(number), partial(_given, images), truth)
+        yield _made(kind, number, images, Truth(homography))
 
 
 def _facade(
@@ -193,7 +191,7 @@ def hard_views(data: Path) -> Iterator[JudgedPair]:
     for number in range(HARD):
         kind = ("seen from the side", "seen from the side", "zoomed", "other tones")[number % 4]
         images, homography = _hard_view(photographs, number, kind)
-        yield JudgedPair(kind, str(number), partial(_given, images), Truth(homography))
+        yield _made(kind, number, images, Truth(homography))
 
 
 def _hard_view(photographs: Photographs, number: int, kind: str) -> tuple[Images, np.ndarray]:
@@ -241,8 +239,7 @@ def overlays(data: Path) -> Iterator[JudgedPair]:
         texture = photographs.any(rng, images[0].shape[1::-1])
         both = [np.where(mask[..., None], noisy(texture, rng), image) for image in images]
         truth = Truth(pair.homography, ~mask) if number % 2 else Truth(posed=seen, by_pose=True)
-        made = partial(_given, (both[0], both[1]))
-        yield JudgedPair(f"overlay of {share:.0%}", str(number), made, truth)
+        yield _made(f"overlay of {share:.0%}", number, (both[0], both[1]), truth)
 
 
 def _overlay(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> np.ndarray:
@@ -280,25 +277,14 @@ def frames(data: Path) -> Iterator[JudgedPair]:
         if kind == 0:
             shown[round(at * height) : round((1 - at) * height)] = 1
         elif kind == 1:
-            cv2.ellipse(
-                shown,
-                (width // 2, height // 2),
-                (width // 2, round(0.6 * height)),
-                0,
-                0,
-                360,
-                1,
-                -1,
-            )
+            axes = width // 2, round(0.6 * height)
+            cv2.ellipse(shown, (width // 2, height // 2), axes, 0, 0, 360, 1, -1)
         else:
             top, left = round(at * height), round(at * width)
             shown[top : height - top, left : width - left] = 1
         kinds = "letter box", "round lens", "border of a scan"
-        both = [image * shown[..., None] for image in images]
-        made = partial(_given, (both[0], both[1]))
-        yield JudgedPair(
-            f"frame, {kinds[kind]}", str(number), made, Truth(posed=pair, by_pose=True)
-        )
+        both = images[0] * shown[..., None], images[1] * shown[..., None]
+        yield _made(f"frame, {kinds[kind]}", number, both, Truth(posed=pair, by_pose=True))
 
 
 def strips(data: Path) -> Iterator[JudgedPair]:
@@ -323,8 +309,7 @@ def strips(data: Path) -> Iterator[JudgedPair]:
         curve = np.rint(255 * (np.arange(256) / 255) ** (2 ** rng.uniform(-1, 1)))
         lit = noisy(cv2.LUT(moved, curve.astype(np.uint8)) * ramp, rng)
         source = "exposures" if exposed and number % 2 else "photographs"
-        made = partial(_given, (parts[0], lit))
-        yield JudgedPair(f"strips of {source}", str(number), made, Truth(homography))
+        yield _made(f"strips of {source}", number, (parts[0], lit), Truth(homography))
 
 
 def noise(data: Path) -> Iterator[JudgedPair]:
@@ -334,4 +319,4 @@ def noise(data: Path) -> Iterator[JudgedPair]:
         rng = np.random.default_rng([6, number])
         blank = np.full((*SIZE[::-1], 3), rng.integers(0, 256), np.uint8)
         images = photographs.any(rng), noisy(blank, rng)
-        yield JudgedPair("nothing", str(number), partial(_given, images), UNRELATED)
+        yield _made("nothing", number, images, UNRELATED)

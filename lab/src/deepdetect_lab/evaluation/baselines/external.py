@@ -22,18 +22,20 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import onnx
 
 from deepdetect._shared.errors import OptionError, WeightsError, first_line
 from deepdetect._shared.opencv import cv2
 from deepdetect._shared.options import look_up
 from deepdetect._shared.records import file_digest
-from deepdetect._shared.runtimes import import_openvino, start_session
+from deepdetect.detector.backends.interface import RuntimeOptions, Session
+from deepdetect.detector.backends.registry import open_graph
 from deepdetect.features.keypoints import Keypoints
 
 from .hessian import HESSIAN
@@ -103,70 +105,46 @@ def onnx_feature(
     file = Path(path)
     try:
         version = file_digest(file)[:16]
-        network = _OPENERS[backend](file, threads)
+        graph = onnx.load(file, load_external_data=False).graph
+        session = open_graph(file, RuntimeOptions(backend, threads=threads))
     except Exception as error:  # the exceptions of runtimes have no common base
         raise WeightsError(f"{file} is not a usable ONNX file ({first_line(error)})") from None
-    shapes = network.shapes
+    shapes = [
+        [side.dim_value or None for side in one.type.tensor_type.shape.dim]
+        for one in graph.input
+        if one.name in session.inputs
+    ]
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] not in (1, 3):
         raise WeightsError(f"{file} must have one input, 1x3xHxW or 1x1xHxW, not {shapes}")
-    if "scores" not in network.outputs or not {"keypoints", "descriptors"} & {*network.outputs}:
+    outputs = session.outputs
+    if "scores" not in outputs or not {"keypoints", "descriptors"} & {*outputs}:
         raise WeightsError(
             f"{file} must have the outputs 'scores' and 'keypoints', or the maps 'scores' and "
-            f"'descriptors', not {network.outputs}"
+            f"'descriptors', not {outputs}"
         )
-    learned = "descriptors" in network.outputs
-    return _external_feature(file.stem, partial(_run_onnx, network), version, learned)
+    learned = "descriptors" in outputs
+    return _external_feature(file.stem, partial(_run_onnx, session, shapes[0]), version, learned)
 
 
-class _Network(NamedTuple):
-    """A loaded ONNX file. `shapes` has each input's shape, in which free sides are not integers."""
-
-    shapes: list[list[Any]]
-    outputs: list[str]
-    run: Callable[[np.ndarray], Iterable[np.ndarray]]
-
-
-def _open_onnxruntime(path: Path, threads: int | None) -> _Network:
-    session = start_session(str(path), threads)
-    shapes, outputs = [x.shape for x in session.get_inputs()], session.get_outputs()
-    name = session.get_inputs()[0].name
-    return _Network(
-        shapes, [x.name for x in outputs], lambda planes: session.run(None, {name: planes})
-    )
-
-
-def _open_openvino(path: Path, threads: int | None) -> _Network:
-    settings: dict[str, object] = {"INFERENCE_PRECISION_HINT": "f32"}
-    if threads is not None:
-        settings["INFERENCE_NUM_THREADS"] = threads
-    model = import_openvino().Core().compile_model(str(path), "CPU", settings)
-    shapes = [
-        [side.get_length() if side.is_static else None for side in x.partial_shape]
-        for x in model.inputs
-    ]
-    outputs = [x.get_any_name() for x in model.outputs]
-    return _Network(shapes, outputs, lambda planes: model([planes]).to_tuple())
-
-
-_OPENERS = {"onnxruntime": _open_onnxruntime, "openvino": _open_openvino}
-
-
-def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
+def _run_onnx(
+    session: Session, shape: Sequence[int | None], rgb: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Run a network whose input has this shape, in which free sides are None."""
     height, width = rgb.shape[:2]
-    channels, *sides = network.shapes[0][1:]
-    maps = "keypoints" not in network.outputs
+    maps = "keypoints" not in session.outputs
     wanted = [
-        side if isinstance(side, int) else max(1, round(own / MAP_SIDE)) * MAP_SIDE if maps else own
-        for side, own in zip(sides, (height, width), strict=True)
+        side or (max(1, round(own / MAP_SIDE)) * MAP_SIDE if maps else own)
+        for side, own in zip(shape[2:], (height, width), strict=True)
     ]
     # Area averaging is only good for downscaling; when upscaling, it would repeat pixels.
     smaller = wanted[0] <= height and wanted[1] <= width
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     resized = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=method)
     planes = np.ascontiguousarray(resized.transpose(2, 0, 1)[None], np.float32) / 255
-    if channels == 1:
+    if shape[1] == 1:
         planes = planes.mean(axis=1, keepdims=True)
-    found = dict(zip(network.outputs, network.run(planes), strict=True))
+    values = session.run(session.outputs, {session.inputs[0]: planes})
+    found = dict(zip(session.outputs, values, strict=True))
     if maps:
         parts = _maxima(found["scores"][0, 0], found["descriptors"][0])
     else:

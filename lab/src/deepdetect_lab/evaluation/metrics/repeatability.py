@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from deepdetect.geometry.transforms import transform_points
+from deepdetect.io.image import at_pixels
 
 from .homography import Sizes, project_visible
 
@@ -157,9 +158,4 @@ def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.
 
 def foreground_fraction(xy: np.ndarray, foreground: np.ndarray) -> float:
     """Return the fraction of keypoints, (N, 2), on the (H, W) foreground mask; NaN if N is 0."""
-    if not len(xy):
-        return float("nan")
-    height, width = foreground.shape
-    column, row = np.rint(np.asarray(xy)).astype(int).T
-    inside = foreground[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    return float(inside.mean())
+    return float(at_pixels(foreground, xy).mean()) if len(xy) else float("nan")

@@ -15,7 +15,7 @@ from ...datasets.planar import PlanarPair
 from ..options import BenchmarkOptions
 from ..report import Section
 from ..run import Run
-from .standard import standard_section
+from .standard import standard_sections
 
 TEXT = (
     "The second image of each pair is replaced by a darkened or blurred copy; the first image is "
@@ -30,7 +30,8 @@ def degraded_sections(
     run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], key: str, title: str
 ) -> list[Section]:
     """Run the standard protocol with each degradation, if "degraded" is among the protocols."""
-    sections = []
+    sections: list[Section] = []
+    standard = replace(options, protocols=("standard",))
     for name, degradation in DEGRADATIONS.items() if "degraded" in options.protocols else ():
         made = (
             run.attempt(f"{pair.name}, {name}", degraded_pair, pair, degradation, run.files_folder)
@@ -38,7 +39,7 @@ def degraded_sections(
         )
         worse = [pair for pair in made if pair is not None]
         named = f"{key}_{name}", f"{title}, {degradation.title}"
-        sections.append(standard_section(run, options, worse, *named, TEXT))
+        sections += standard_sections(run, standard, worse, *named, TEXT)
     return sections
 
 

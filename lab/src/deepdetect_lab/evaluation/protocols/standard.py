@@ -68,27 +68,20 @@ MATCHING_NOTE = (
 
 
 def standard_sections(
-    run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], *texts: str
-) -> list[Section]:
-    """Return the section of `standard_section` in a list, empty if "standard" is not requested."""
-    wanted = "standard" in options.protocols
-    return [standard_section(run, options, pairs, *texts)] if wanted else []
-
-
-def standard_section(
     run: Run,
     options: BenchmarkOptions,
     pairs: Sequence[PlanarPair],
     key: str,
     title: str,
     text: str,
-) -> Section:
-    """Measure all features on all pairs; return a section of the report with the tables."""
+) -> list[Section]:
+    """Measure all features on all pairs, and tabulate them, if "standard" is requested."""
+    if "standard" not in options.protocols:
+        return []
     features = options.standard_features()
     rows = standard_rows(run, features, pairs)
-    what = f"{title} ({len(pairs)} pairs)"
-    tables = standard_tables(features, rows, key, what)
-    return Section(f"{title}, the standard protocol", (text,), tables)
+    tables = standard_tables(features, rows, key, f"{title} ({len(pairs)} pairs)")
+    return [Section(f"{title}, the standard protocol", (text,), tables)]
 
 
 def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:

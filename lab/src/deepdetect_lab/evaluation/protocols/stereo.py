@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from deepdetect._shared.errors import ImageError
-from deepdetect.geometry.camera import Calibration
 from deepdetect.geometry.point_cloud import PointCloud
 
 from ...datasets.middlebury import CalibratedStereoPair, load_calibrated_pair, load_middlebury
@@ -144,14 +143,6 @@ def points_table(
     return with_paper_column(Table(key, title, columns, lines, note), "points", paper)
 
 
-def _triangulate(
-    calibration: Calibration, pixels: np.ndarray, disparity: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    depth = calibration.depth_mm(disparity)
-    kept = np.isfinite(depth)
-    return calibration.camera0.rays(pixels[kept]) * depth[kept, None], kept
-
-
 def clouds_figure(
     pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, Row]
 ) -> Figure | None:
@@ -162,8 +153,11 @@ def clouds_figure(
         points = found.get(pipeline.name)
         if not pipeline.drawn or points is None:
             continue
-        space, kept = _triangulate(pair.calibration, points["pixels"], points["disparity"])
-        columns, rows = np.rint(points["pixels"][kept]).astype(np.int64).T
+        depth = pair.calibration.depth_mm(points["disparity"])
+        kept = np.isfinite(depth)
+        pixels = points["pixels"][kept]
+        space = pair.calibration.camera0.rays(pixels) * depth[kept, None]
+        columns, rows = np.rint(pixels).astype(np.int64).T
         unit = "mm" if pair.calibration.baseline_mm else "baseline"
         clouds[pipeline.drawn] = PointCloud(space, pair.left[rows, columns], unit)
     if not any(map(len, clouds.values())):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,23 +99,15 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
 def _ours(
     scene: CalibratedStereoPair, *, detector: AnyDetector, density: float | None = None
 ) -> Callable[[], Points]:
+    def run() -> Points:
+        how: dict[str, Any] = {"calibration": scene.calibration, "rectified": True}
+        selection = SelectionOptions(density=density)
+        found = reconstruct(scene.left, scene.right, detector, selection=selection, **how)
+        assert found.disparity is not None
+        return found.pixels, found.disparity, int(np.count_nonzero(~found.matched))
+
     _compile_kernels()
-    return partial(_reconstructed, scene, detector, density)
-
-
-def _reconstructed(
-    scene: CalibratedStereoPair, detector: AnyDetector, density: float | None
-) -> Points:
-    found = reconstruct(
-        scene.left,
-        scene.right,
-        detector,
-        calibration=scene.calibration,
-        rectified=True,
-        selection=SelectionOptions(density=density),
-    )
-    assert found.disparity is not None
-    return found.pixels, found.disparity, int(np.count_nonzero(~found.matched))
+    return run
 
 
 def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> Callable[[], Points]:

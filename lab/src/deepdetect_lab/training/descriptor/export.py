@@ -17,14 +17,14 @@ from deepdetect._shared.atomic import atomic_path
 from deepdetect.detector.points.descriptor import STRIDE
 
 from ...networks.export import to_onnx
-from .network import KeypointNetwork
+from .network import DescriptorNetwork
 
 MIN_HALVED = 1000
 """Kernels with more values than this are stored as float16, which halves the file. The graph
 converts them to float32 before it computes with them. Chosen by hand."""
 
 
-def export_descriptor(network: KeypointNetwork, path: Path) -> None:
+def export_descriptor(network: DescriptorNetwork, path: Path) -> None:
     """Write a network as an ONNX file for `PointDetector(descriptor=...)`.
 
     `DESCRIPTOR_GRAPHS` lists the inputs and outputs.

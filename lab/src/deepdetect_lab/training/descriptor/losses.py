@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from ..scenes import SIDE_PX
-from .network import KeypointNetwork, turn
+from .network import DescriptorNetwork, turn
 from .views import Pair
 
 NEAR_PX = 3.0
@@ -34,7 +34,7 @@ def kind_of(angle: float, zoom: float) -> str:
     return "upright" if angle < UPRIGHT else "turned"
 
 
-def describe_views(network: KeypointNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
+def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
     """Return descriptors (B, N, 64) of the keypoints of each view; rotations are not undone."""
     images = batch.images.transpose(0, 1).flatten(0, 1)
     positions = torch.cat([batch.positions0, batch.positions1])
@@ -44,7 +44,7 @@ def describe_views(network: KeypointNetwork, batch: Pair) -> tuple[Tensor, Tenso
     return first, second
 
 
-def maps_of(network: KeypointNetwork, images: Tensor) -> list[list[Tensor]]:
+def maps_of(network: DescriptorNetwork, images: Tensor) -> list[list[Tensor]]:
     """Return the network's feature maps of images (B, S, S) uint8, computed in bfloat16."""
     values = images[:, None].float() / 255
     with torch.autocast(images.device.type, torch.bfloat16):
@@ -67,7 +67,7 @@ def mirror(batch: Pair, which: Tensor) -> Pair:
 
 
 def contrastive_loss(
-    network: KeypointNetwork, batch: Pair, generator: np.random.Generator
+    network: DescriptorNetwork, batch: Pair, generator: np.random.Generator
 ) -> Tensor:
     """Return the symmetric InfoNCE loss, the cross-entropy of the true match among all keypoints.
 
@@ -100,7 +100,7 @@ def _near(xy: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def shares_right(network: KeypointNetwork, batches: Iterable[Pair]) -> dict[str, float]:
+def shares_right(network: DescriptorNetwork, batches: Iterable[Pair]) -> dict[str, float]:
     """Return the share of keypoints whose mutual nearest neighbour is correct, by kind of pair.
 
     The network must be in evaluation mode, and `batches` must hold pairs of each of `KINDS`.

@@ -9,9 +9,8 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, kl_div, log_softmax, normalize
 
 from .crops import Crops
-from .edge import EdgeNetwork
 from .losses import maps_of
-from .network import turn
+from .network import DescriptorNetwork, turn
 
 PAIR_WEIGHT, CODE_WEIGHT, RELATION_WEIGHT, NEIGHBOUR_WEIGHT = 5.0, 14.0, 45.0, 3.0
 """Weights of losses: the contrastive loss of pairs; 1 - cosine to the teachers' codes; the squared
@@ -29,7 +28,7 @@ SAME = 1e-6
 """Similarities that differ by less than this count as equal: a point may be in a crop twice."""
 
 
-def crop_losses(network: EdgeNetwork, crops: Crops) -> dict[str, Tensor]:
+def crop_losses(network: DescriptorNetwork, crops: Crops) -> dict[str, Tensor]:
     """Return, by name, the weighted losses by which the network learns from the teachers."""
     maps = maps_of(network, crops.images)
     features = network.features(maps, crops.positions, crops.sizes)
@@ -47,7 +46,7 @@ def crop_losses(network: EdgeNetwork, crops: Crops) -> dict[str, Tensor]:
     }
 
 
-def predict_codes(network: EdgeNetwork, code: Tensor, crops: Crops) -> Tensor:
+def predict_codes(network: DescriptorNetwork, code: Tensor, crops: Crops) -> Tensor:
     """Return (B, N, 192) predicted codes of the teachers, of length 1.
 
     The teachers saw the photographs before rotation, so the descriptors are rotated back.
@@ -71,7 +70,7 @@ def neighbours_differ(found: Tensor, known: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def measure_teaching(network: EdgeNetwork, crops: Iterable[Crops]) -> dict[str, float]:
+def measure_teaching(network: DescriptorNetwork, crops: Iterable[Crops]) -> dict[str, float]:
     """Measure, on validation crops, how well a network in evaluation mode has learned.
 
     The measures are the mean cosine of predicted codes to the teachers' codes, the share of points

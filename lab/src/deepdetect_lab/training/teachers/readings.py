@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.opencv import cv2
 from deepdetect._shared.progress import progress
+from deepdetect._shared.records import save_arrays
 from deepdetect._shared.runtimes import start_session
 from deepdetect.detector.points.detection import SIZE_PER_SIGMA, least_distances, rank_candidates
 from deepdetect.detector.points.hessian_scales import build_scale_space
@@ -170,11 +170,7 @@ def write_readings(
     with progress(len(left), "reading", "photograph", quiet) as bar:
         for image in left:
             reading = read_photograph(teachers, image)
-            with (
-                atomic_path(reading_file(image, folder)) as temporary,
-                temporary.open("wb") as file,
-            ):
-                np.savez(file, **reading._asdict())
+            save_arrays(reading_file(image, folder), reading._asdict(), compress=False)
             bar.update(1)
             yield len(reading.xy)
 
