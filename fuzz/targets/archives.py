@@ -1,24 +1,19 @@
-"""Archives of data sets, and shards."""
+"""Archives of data sets."""
 
 from __future__ import annotations
 
 import io
-import json
 import os
 import tarfile
-import tempfile
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from deepdetect_lab.datasets.download import RemoteFile, _unpack
 
-from ..case import Target, expect, prepared
+from ..case import Target, expect
 from ..mutations import mutate
-from .images import scene
 
 NAMES = (
     *("image.png", "folder/image.png", "../outside.png", "/tmp/fuzz-outside.png", "a/../../b"),
@@ -86,65 +81,4 @@ def tar_file(generator: np.random.Generator, compressed: bool) -> bytes:
     return file.getvalue()
 
 
-def shard_options() -> Any:
-    """Return the recipe of the shards."""
-    from deepdetect_lab.labels import LabelOptions
-    from deepdetect_lab.training.recipe import Stage, TrainingOptions
-
-    labels = LabelOptions(("fast", "sobel"))
-    return TrainingOptions(
-        stages=(Stage(32, 2, 1),), short_sides=(48,), labels=labels, val_fraction=0.3
-    )
-
-
-@prepared
-def shard_files() -> dict[str, bytes]:
-    """Return the files of a folder of shards of three images."""
-    from deepdetect_lab.training.shards import write_shards
-
-    with tempfile.TemporaryDirectory() as folder:
-        images, output = Path(folder) / "images", Path(folder) / "shards"
-        images.mkdir()
-        for k in range(6):
-            Image.fromarray(np.roll(scene(), 5 * k, axis=1)).save(images / f"photo-{k}.png")
-        write_shards(images, output, shard_options(), workers=1)
-        return {path.name: path.read_bytes() for path in output.iterdir()}
-
-
-def shards(generator: np.random.Generator, folder: Path) -> None:
-    """Read all images of shards of which one file is damaged."""
-    from deepdetect_lab.training.shards import Shards, ShardSource
-
-    options = shard_options()
-    files = dict(shard_files())
-    name = str(generator.choice(sorted(files)))
-    if name == "shards.json" and generator.random() < 0.5:
-        index = json.loads(files[name])
-        row = index["training"][0]
-        strange = ["/etc/passwd", "../secret.tar", "", None, 3, "\x00", {}]
-        row["file"] = strange[int(generator.integers(len(strange)))]
-        if generator.random() < 0.3:
-            row["images"] = [-1, 10**9, None, "x", 1.5][int(generator.integers(5))]
-        files[name] = json.dumps(index).encode()
-    else:
-        files[name] = mutate(files[name], generator)
-    for name, content in files.items():
-        (folder / name).write_bytes(content)
-    found = Shards.open(folder, options)
-    for part in (found.training, found.validation):
-        for path, _ in part:
-            expect(path.parent == folder, f"a shard outside the folder: {path}")
-        source = ShardSource(part, options)
-        for k in range(min(len(source), 5)):
-            image = source[k]
-            for view in (*image.normal, *image.dark):
-                if part is found.validation and view.augmentation is not None:
-                    continue  # those are for training
-                pixels, mask = source.load(k, view)
-                expect(mask.shape == pixels.shape[:2], "a label of another size")
-
-
-TARGETS = (
-    Target("archives", "archives (zip, tar)", archives, 900),
-    Target("shards", "shards", shards, 700, 350),
-)
+TARGETS = (Target("archives", "archives (zip, tar)", archives, 900),)

@@ -1,4 +1,4 @@
-"""`deepdetect train` and `deepdetect dev shards`: options, output, and errors in terms of flags."""
+"""`deepdetect train`: options, output, and errors in terms of flags."""
 
 from __future__ import annotations
 
@@ -29,21 +29,16 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_train_and_shards(run, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fixed = ["--short-side", "64", "--detectors", "fast", "--workers", "1"]
-    packed = run("dev", "shards", images, "-o", "packed", "--shard-size", "3", *fixed, "--json")
-    assert packed.exit_code == 0, packed.output
-    values = json.loads(packed.stdout)
-    assert (values["training"], values["validation"]) == (5, 1)
-    trained = run("train", "packed", "-o", "run", *TINY, "--workers", "1", "--json")
+def test_train(run, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained = run("train", images, "-o", "run", *TINY, "--workers", "1", "--json")
     assert trained.exit_code == 0, trained.output
     values = json.loads(trained.stdout)
     assert Path(values["onnx"]).is_file()
     assert values["validation_loss"] > 0
     monkeypatch.setattr(DenseTrainer, "export", lambda *_: None)  # it is there
-    again = run("train", "packed", "-o", "run", *TINY, "--workers", "1")
+    again = run("train", images, "-o", "run", *TINY, "--workers", "1")
     assert "validation loss" in again.output
-    other = run("train", "packed", "-o", "run", *TINY, "--short-side", "96")
+    other = run("train", images, "-o", "run", *TINY, "--short-side", "96")
     assert other.exit_code == 2
     assert "--short-side" in other.stderr
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -73,14 +72,3 @@ def test_batches_go_through_the_epochs_of_each_stage() -> None:
 def test_batches_start_at_any_step() -> None:
     schedule = Schedule(OPTIONS, 10)
     assert list(schedule.batches(3)) == list(schedule.batches())[3:]
-
-
-@given(sizes=st.lists(st.integers(1, 5), min_size=1, max_size=14), epoch=st.integers(0, 3))
-def test_few_shards_are_read_at_a_time(sizes: list[int], epoch: int) -> None:
-    count = sum(sizes)
-    order = epoch_order(0, epoch, count, tuple(sizes))
-    assert sorted(order) == list(range(count))
-    shard_of = np.repeat(np.arange(len(sizes)), sizes)[order]
-    places = [np.flatnonzero(shard_of == shard) for shard in range(len(sizes))]
-    for step in range(count):  # shards that have been begun and not finished
-        assert sum(place[0] <= step < place[-1] for place in places) <= 4

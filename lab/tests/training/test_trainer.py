@@ -256,18 +256,6 @@ def test_the_caller_keeps_its_random_numbers() -> None:
         assert torch.equal(one, other)
 
 
-@pytest.mark.slow
-def test_shards_train_like_a_folder(photographs: Path, tmp_path: Path, fit, labels: Path) -> None:
-    from deepdetect_lab.training.shards import write_shards
-
-    shards = write_shards(photographs, tmp_path / "shards", TINY, shard_size=3, workers=1)
-    result = fit(tmp_path / "run", TINY, images=tmp_path / "shards")
-    assert result.best["images"] == sum(count for _, count in shards.training) // 4 * 4
-    other = fit(tmp_path / "other", TINY, images=tmp_path / "shards", validation=photographs)
-    assert other.points[0]["training_loss"] == result.points[0]["training_loss"]
-    assert other.points[0]["validation_loss"] != result.points[0]["validation_loss"]
-
-
 def command(photographs: Path, run: Path, labels: Path, *more: str) -> list[str]:
     """A run in a process of its own, which can be killed."""
     return [

@@ -34,7 +34,6 @@ DEVELOPMENT = {
         ),
     },
     "Weights": {
-        "shards": ("deepdetect_lab.cli.train", "Pack images for training on large sets."),
         "read-teachers": (
             "deepdetect_lab.cli.train",
             "Compute published descriptors at points of photographs, to learn from them.",

@@ -1,4 +1,4 @@
-"""Commands that train networks, label images, write shards and average weights."""
+"""Commands that train networks, label images and average weights."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ from ..training import (
     PointsTrainingOptions,
     Stage,
     TrainingOptions,
-    write_shards,
 )
 from ..training import train as train_network
 from ..training import train_on_pairs as train_network_on_pairs
 from ..training.run import PairOptions
 
-Folder = Annotated[Path, Parameter(help="Folder of images; `train` also takes shards.")]
+Folder = Annotated[Path, Parameter(help="Folder of images.")]
 RUN = cli.From(
     train_network,
     "validation init_weights",
@@ -64,10 +63,6 @@ RECIPE = cli.From(
     },
 )
 DEVICE = cli.From(DeviceOptions, "device")
-SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides square val_fraction")
-"""Options of a recipe that must not change after the shards are written."""
-
-SHARDS_RUN = cli.From(write_shards, "shard_size", more="workers")
 PAIRS_RUN = cli.From(
     train_network_on_pairs,
     "validation init_weights readings device num_workers",
@@ -134,7 +129,7 @@ def train(
     output: cli.Output,
     **values: Any,
 ) -> cli.Result:
-    """Train the network on the images, or the shards, in a folder.
+    """Train the network on the images in a folder.
 
     First, the detectors of `deepdetect label` make the labels. The output folder gets the weights
     with the lowest validation loss (best.safetensors, deepdetect.onnx), the loss curves
@@ -245,35 +240,6 @@ def train_match_filter(images: Folder, /, *, output: cli.Output, **values: Any) 
         output: Folder of the run.
     """
     return _train_on_pairs(images, output, MatchFilterTrainingOptions, values)
-
-
-@cli.command(PRESET, LABELS, SHARDS, SHARDS_RUN)
-def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
-    """Pack the images in a folder with their labels into tar files.
-
-    The files have WebDataset's layout. Training reads a few of them at a time, so they may be on a
-    slow disk or a network drive. Give `train` the same options. To resume, run the command again.
-
-        deepdetect dev shards --preset paper data/coco -o data/shards
-        deepdetect train --preset paper data/shards -o run
-
-    Args:
-        output: Folder for the shards.
-    """
-    folder = cli.output_folder(output)
-    how = SHARDS_RUN.take(values)
-    # A recipe needs a stage, but shards do not depend on it. Crops of 16 pixels fit into any view.
-    recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
-    made = write_shards(images, folder, recipe, quiet=False, **how)
-    return cli.Result(
-        {
-            "folder": folder,
-            "training": sum(count for _, count in made.training),
-            "validation": sum(count for _, count in made.validation),
-            "shards": len(made.training) + len(made.validation),
-            "bytes": sum(path.stat().st_size for path, _ in made.training + made.validation),
-        }
-    )
 
 
 @cli.command(LABELS, cli.From(LabelOptions, "visibility", more=""))

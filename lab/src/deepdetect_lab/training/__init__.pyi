@@ -11,5 +11,4 @@ from .run import (
     train as train,
     train_on_pairs as train_on_pairs,
 )
-from .shards import write_shards as write_shards
 from .trainer import TrainingResult as TrainingResult

@@ -25,7 +25,6 @@ from ..labels import LabelOptions
 from .augmentation import add_sensor_noise, jitter_color, transpose
 from .recipe import Stage, TrainingOptions
 from .sampler import CropIndex
-from .shards import Shards, ShardSource
 from .views import (
     SourceImage,
     View,
@@ -44,8 +43,6 @@ class FolderSource:
     a digest of the image, so a replaced image gets a new label. Up to `memory_bytes` of views are
     kept in memory.
     """
-
-    shard_sizes = None
 
     def __init__(
         self,
@@ -132,9 +129,6 @@ def _make_labels(task: LabelTask, options: LabelOptions) -> tuple[int, list[str]
     return len(labels), []
 
 
-ImageSource = FolderSource | ShardSource
-
-
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
     """Random augmented crops of views, indexed by the `CropIndex` entries of a `Schedule`.
 
@@ -142,7 +136,7 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
     random choices depend only on the index and the seed of the options.
     """
 
-    def __init__(self, source: ImageSource, options: TrainingOptions) -> None:
+    def __init__(self, source: FolderSource, options: TrainingOptions) -> None:
         self.source, self.options = source, options
 
     def __len__(self) -> int:
@@ -185,7 +179,7 @@ class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
     Each image comes twice: all images in normal light come first, then all of them darkened.
     """
 
-    def __init__(self, source: ImageSource) -> None:
+    def __init__(self, source: FolderSource) -> None:
         self.source = source
 
     def __len__(self) -> int:
@@ -201,8 +195,8 @@ class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
 class TrainingData:
     """Training and validation images of a run, and a digest of all of them."""
 
-    training: ImageSource
-    validation: ImageSource
+    training: FolderSource
+    validation: FolderSource
     digest: str
 
 
@@ -224,15 +218,13 @@ def prepare_data(
     """
     images, output = Path(images), Path(output)
     folder = output / "labels" if labels is None else Path(labels)
-    shards = Shards.open(images, options)
-    listed, held_out = [], []
-    if shards is None:
-        others = (output, folder) if validation is None else (output, folder, Path(validation))
-        listed = list_images(images, options, others, options.max_images)
-    if validation is not None:
-        held_out = list_images(Path(validation), options, (output, folder, images))
-    elif shards is None:
+    if validation is None:
+        listed = list_images(images, options, (output, folder), options.max_images)
         listed, held_out = train_val_split(listed, options.val_fraction)
+    else:
+        others = output, folder, Path(validation)
+        listed = list_images(images, options, others, options.max_images)
+        held_out = list_images(Path(validation), options, (output, folder, images))
     memory = available_memory() // 2 // processes
     training = FolderSource(listed, folder, options.labels, memory)
     held = FolderSource(held_out, folder, options.labels, memory // 8)
@@ -240,14 +232,7 @@ def prepare_data(
     training.make_labels(views, workers, quiet)
     held.make_labels([image.validation_views for image in held_out], workers, quiet)
     digests = [[image.digest for image in part] for part in (listed, held_out)]
-    if shards is None:
-        return TrainingData(training, held, key(digests)[:16])
-    names = [path.name for path, _ in shards.training + shards.validation]
-    return TrainingData(
-        ShardSource(shards.training, options),
-        ShardSource(shards.validation, options) if validation is None else held,
-        key(names, digests)[:16],
-    )
+    return TrainingData(training, held, key(digests)[:16])
 
 
 @contextlib.contextmanager

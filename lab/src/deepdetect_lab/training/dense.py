@@ -114,7 +114,7 @@ class DenseTrainer(Trainer):
         self.compiled = has_compiler if device.compile is None else device.compile
         self._forward = self._set_up()
         self.optimizers = make_optimizers(options.optimizer, network)
-        self.schedule = Schedule(options, len(data.training), data.training.shard_sizes)
+        self.schedule = Schedule(options, len(data.training))
         self.steps = self.schedule.steps
         self.milestones = milestones(self.steps, options.val_count)
         self.origin = {"images_digest": data.digest, "initial_weights": initial_weights}

@@ -46,7 +46,7 @@ def train(
     call this under `if __name__ == "__main__":`.
 
     Args:
-        images: folder of images, or of shards (`write_shards`).
+        images: folder of images.
         output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx,
             MODEL_CARD.md and the loss curves.
         options: the recipe.

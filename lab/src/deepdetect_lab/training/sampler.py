@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +13,6 @@ from .recipe import Stage, TrainingOptions
 
 FINAL_LEARNING_RATE = 1e-6
 """Cosine annealing of the learning rate ends at this value (paper, Section III-B)."""
-
-SHUFFLED_SHARDS = 4
-"""Number of shards that are read at a time and shuffled together. Chosen by hand; not measured."""
 
 
 class CropIndex(NamedTuple):
@@ -33,8 +30,6 @@ class Schedule:
     Args:
         options: the recipe.
         images: number of images.
-        shard_sizes: number of images in each shard; images of only a few shards are mixed at a
-            time. None: the images are not in shards, and are all mixed.
 
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
@@ -42,12 +37,9 @@ class Schedule:
         [[3, 0], [2, 1]]
     """
 
-    def __init__(
-        self, options: TrainingOptions, images: int, shard_sizes: Sequence[int] | None = None
-    ) -> None:
+    def __init__(self, options: TrainingOptions, images: int) -> None:
         self.options = options
         self.images = images
-        self.shard_sizes = None if shard_sizes is None else tuple(shard_sizes)
         self.steps_of_stage = [
             max(1, stage.epochs * images // stage.batch) for stage in options.stages
         ]
@@ -76,7 +68,7 @@ class Schedule:
         for sample in range(start, start + stage.batch):
             epoch, place = divmod(sample, self.images)
             epoch += first_epoch
-            order = epoch_order(self.options.seed, epoch, self.images, self.shard_sizes)
+            order = epoch_order(self.options.seed, epoch, self.images)
             batch.append(CropIndex(int(order[place]), epoch, place, stage))
         return batch
 
@@ -98,20 +90,6 @@ def milestones(steps: int, count: int) -> set[int]:
 
 
 @functools.lru_cache(maxsize=16)  # interleaved stages are in different epochs
-def epoch_order(
-    seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
-) -> np.ndarray:
-    """Return the numbers of the images in the random order of an epoch.
-
-    With shards, the order of the shards is random, and the images of `SHUFFLED_SHARDS` successive
-    shards are shuffled together.
-    """
-    if shard_sizes is None:
-        return np.random.default_rng([seed, 1, epoch]).permutation(count)
-    shards = np.split(np.arange(count), np.cumsum(shard_sizes)[:-1])
-    order = np.random.default_rng([seed, 3, epoch]).permutation(len(shards))
-    groups = []
-    for k, first in enumerate(range(0, len(order), SHUFFLED_SHARDS)):
-        group = np.concatenate([shards[s] for s in order[first : first + SHUFFLED_SHARDS]])
-        groups.append(np.random.default_rng([seed, 4, epoch, k]).permutation(group))
-    return np.concatenate(groups)
+def epoch_order(seed: int, epoch: int, count: int) -> np.ndarray:
+    """Return the numbers of the images in the random order of an epoch."""
+    return np.random.default_rng([seed, 1, epoch]).permutation(count)
