@@ -8,6 +8,7 @@ import pytest
 
 from deepdetect_lab.training import (
     DescriptorTrainingOptions,
+    MatcherTrainingOptions,
     MatchFilterTrainingOptions,
     PointsTrainingOptions,
     train_on_pairs,
@@ -21,6 +22,7 @@ from deepdetect_lab.training import (
         (PointsTrainingOptions(), "points.task.RankerTrainer"),
         (DescriptorTrainingOptions(), "descriptor.task.DescriptorTrainer"),
         (MatchFilterTrainingOptions(), "match_filter.MatchFilterTrainer"),
+        (MatcherTrainingOptions(), "matcher.task.MatcherTrainer"),
     ],
 )
 def test_pictures_of_validation_and_of_the_run_are_not_trained_on(

@@ -71,7 +71,16 @@ def match_learned(
     features1: Keypoints,
     match: Callable[[np.ndarray, np.ndarray], DescriptorMatches],
 ) -> DescriptorMatches:
-    """Match learned descriptors after undoing the rotation between the two images.
+    """Match learned descriptors after undoing the rotation between the two images."""
+    return match_turned(features0, features1, match)[0]
+
+
+def match_turned(
+    features0: Keypoints,
+    features1: Keypoints,
+    match: Callable[[np.ndarray, np.ndarray], DescriptorMatches],
+) -> tuple[DescriptorMatches, float]:
+    """Match learned descriptors; return also the undone rotation between the images, in degrees.
 
     Descriptors that are rotated to the keypoints' own angles match under any rotation of the image.
     Matches of the best keypoints therefore tell the rotation between the images. Then only this
@@ -82,16 +91,17 @@ def match_learned(
     assert descriptors0 is not None
     assert descriptors1 is not None
     if features0.angles is None or features1.angles is None:
-        return match(descriptors0, descriptors1)
+        return match(descriptors0, descriptors1), 0.0
     angles0, angles1 = features0.angles, features1.angles
     own = match(descriptors0[:TURNED_KEYPOINTS], descriptors1[:TURNED_KEYPOINTS])
     turn = common_turn(angles1[own.indices1] - angles0[own.indices0])
     first = turn_descriptors(descriptors0, angles0)
     turned = match(first, turn_descriptors(descriptors1, angles1 - turn))
     if abs((turn + 180) % 360 - 180) < UPRIGHT_DEGREES:
-        return turned
+        return turned, turn
     # If few descriptors match, the estimated rotation may be random, so 0 is tried as well.
-    return max(match(first, turn_descriptors(descriptors1, angles1)), turned, key=len)
+    upright = match(first, turn_descriptors(descriptors1, angles1))
+    return (turned, turn) if len(turned) > len(upright) else (upright, 0.0)
 
 
 def common_turn(degrees: np.ndarray) -> float:

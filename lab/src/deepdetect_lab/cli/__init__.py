@@ -39,6 +39,10 @@ DEVELOPMENT = {
             "Compute published descriptors at points of photographs, to learn from them.",
         ),
         "train-points": ("deepdetect_lab.cli.train", "Train the ranker of keypoints on images."),
+        "train-matcher": (
+            "deepdetect_lab.cli.train",
+            "Train the network that matches keypoints by attention.",
+        ),
         "train-match-filter": (
             "deepdetect_lab.cli.train",
             "Train the network that separates correct matches from wrong ones.",

@@ -22,6 +22,7 @@ from ..training import (
     PRESETS,
     DescriptorTrainingOptions,
     DeviceOptions,
+    MatcherTrainingOptions,
     MatchFilterTrainingOptions,
     PointsTrainingOptions,
     Stage,
@@ -65,12 +66,19 @@ RECIPE = cli.From(
 DEVICE = cli.From(DeviceOptions, "device")
 PAIRS_RUN = cli.From(
     train_network_on_pairs,
-    "validation init_weights readings device num_workers",
+    "validation init_weights readings places device num_workers",
     more="",
     flags={"init_weights": "--init"},
-    types={"validation": Path, "init_weights": Path | None, "readings": Path | None},
+    types={
+        "validation": Path,
+        "init_weights": Path | None,
+        "readings": Path | None,
+        "places": Path | None,
+    },
     defaults={"init_weights": "random, by the seed", "num_workers": "0 on a CPU"},
 )
+DESCRIPTOR_RUN = replace(PAIRS_RUN, common="validation init_weights readings device num_workers")
+MATCHER_RUN = replace(PAIRS_RUN, common="validation init_weights places")
 WORKERS_RUN = replace(PAIRS_RUN, common="validation num_workers")
 FILTER_RUN = replace(PAIRS_RUN, common="validation")
 
@@ -184,7 +192,7 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
     return _train_on_pairs(images, output, PointsTrainingOptions, values)
 
 
-@cli.command(PAIRS_RUN, cli.From(DescriptorTrainingOptions, "steps pairs seed"))
+@cli.command(DESCRIPTOR_RUN, cli.From(DescriptorTrainingOptions, "steps pairs seed"))
 def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the learned descriptor of keypoints on the images in a folder.
 
@@ -240,6 +248,23 @@ def train_match_filter(images: Folder, /, *, output: cli.Output, **values: Any) 
         output: Folder of the run.
     """
     return _train_on_pairs(images, output, MatchFilterTrainingOptions, values)
+
+
+@cli.command(MATCHER_RUN, cli.From(MatcherTrainingOptions, "steps drawn learning_rate seed"))
+def train_matcher(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
+    """Train the network that matches keypoints by attention.
+
+    Makes pairs of synthetic views from single images, and pairs of photographs of places if there
+    are any: PLACES/fixed/NAME/ has photographs of a fixed camera, PLACES/moving/NAME/ photographs
+    from several viewpoints. Writes attention.onnx, attention.safetensors, MODEL_CARD.md, training
+    curves, the pairs, and a checkpoint from which the same command resumes an interrupted run.
+
+        deepdetect dev train-matcher photos/train --validation photos/val -o run
+
+    Args:
+        output: Folder of the run.
+    """
+    return _train_on_pairs(images, output, MatcherTrainingOptions, values)
 
 
 @cli.command(LABELS, cli.From(LabelOptions, "visibility", more=""))

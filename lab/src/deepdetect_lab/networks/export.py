@@ -6,7 +6,7 @@ import io
 import logging
 import warnings
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +38,14 @@ _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
 def to_onnx(
     network: nn.Module,
     inputs: Mapping[str, Tensor],
-    output: str,
+    outputs: Sequence[str],
     axes: Mapping[str, Mapping[int, str]],
     training: Any = torch.onnx.TrainingMode.EVAL,
 ) -> onnx.ModelProto:
     """Convert a network to ONNX by tracing it with example `inputs`, which are given by name.
 
-    For each input and for the `output`, `axes` maps the numbers of its axes of variable size to
-    names.
+    For each input and each of the `outputs`, `axes` maps the numbers of its axes of variable size
+    to names.
     """
     written = io.BytesIO()
     with warnings.catch_warnings():
@@ -56,7 +56,7 @@ def to_onnx(
             tuple(inputs.values()),
             written,  # type: ignore[arg-type]  # annotated for the other exporter
             input_names=list(inputs),
-            output_names=[output],
+            output_names=list(outputs),
             dynamic_axes=axes,
             opset_version=OPSET,
             dynamo=False,
@@ -74,7 +74,7 @@ def export_onnx(network: nn.Module, path: str | Path) -> None:
     model = to_onnx(
         module,
         {"image": torch.zeros(2, 3, 64, 96)},
-        "logits",
+        ("logits",),
         {"image": axes, "logits": axes},
         torch.onnx.TrainingMode.PRESERVE,
     )

@@ -1,4 +1,4 @@
-"""Training of the detector, the keypoint ranker, the learned descriptor and the match filter.
+"""Training of the detector, the keypoint ranker, the learned descriptor, and two matchers.
 
 To train the detector, `train` scales images to views, labels the views, and cuts random crops from
 them. A `CropDataset` and a seeded `Schedule` make the batches of a torch `DataLoader`.

@@ -2,6 +2,7 @@ from .recipe import (
     PRESETS as PRESETS,
     DescriptorTrainingOptions as DescriptorTrainingOptions,
     DeviceOptions as DeviceOptions,
+    MatcherTrainingOptions as MatcherTrainingOptions,
     MatchFilterTrainingOptions as MatchFilterTrainingOptions,
     PointsTrainingOptions as PointsTrainingOptions,
     Stage as Stage,

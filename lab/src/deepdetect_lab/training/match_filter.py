@@ -380,4 +380,4 @@ def export_match_filter(network: MatchFilter, sample: Sample, path: Path) -> Non
     inputs = {name: torch.from_numpy(each) for name, each in sample[0].items()}
     axes = {name: {0: "matches"} for name in (*inputs, "logits")}
     with atomic_path(path) as temporary:
-        onnx.save(to_onnx(network, inputs, "logits", axes), temporary)
+        onnx.save(to_onnx(network, inputs, ("logits",), axes), temporary)

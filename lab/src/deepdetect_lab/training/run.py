@@ -14,6 +14,7 @@ from .recipe import (
     DescriptorTrainingOptions,
     DeviceOptions,
     InitWeights,
+    MatcherTrainingOptions,
     MatchFilterTrainingOptions,
     PointsTrainingOptions,
     TrainingOptions,
@@ -23,7 +24,12 @@ if TYPE_CHECKING:
     from .trainer import Trainer, TrainingResult
 
 Log = Callable[[str], None]
-PairOptions = PointsTrainingOptions | DescriptorTrainingOptions | MatchFilterTrainingOptions
+PairOptions = (
+    PointsTrainingOptions
+    | DescriptorTrainingOptions
+    | MatchFilterTrainingOptions
+    | MatcherTrainingOptions
+)
 
 
 @suggest_keywords
@@ -100,15 +106,16 @@ def train_on_pairs(
     *,
     init_weights: str | Path | None = None,
     readings: str | Path | None = None,
+    places: str | Path | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     num_workers: int | None = None,
     log: Log | None = None,
 ) -> TrainingResult:
     """Train a network on pairs of synthetic views of single images.
 
-    The class of `options` chooses the network: the keypoint ranker, the learned descriptor, or the
-    match filter. A match filter takes a quarter of an hour on two processors. An interrupted run
-    resumes as in `train`.
+    The class of `options` chooses the network: the keypoint ranker, the learned descriptor, the
+    matcher, or the match filter. A match filter takes a quarter of an hour on two processors. An
+    interrupted run resumes as in `train`.
 
     Args:
         images: folder of images, ideally with sides of about 480 pixels.
@@ -116,9 +123,12 @@ def train_on_pairs(
         output: folder for checkpoint.safetensors, the best weights (best.npz for a ranker, a
             safetensors and an ONNX file otherwise), MODEL_CARD.md and the training curves.
         options: the recipe.
-        init_weights: weights to start from, for a descriptor only: a descriptor.safetensors file,
-            or EdgePoint2's L64.pth. None: random, from the seed.
+        init_weights: weights to start from, for a descriptor or a matcher: a safetensors file that
+            a run wrote, or EdgePoint2's L64.pth. None: random, from the seed.
         readings: folder written by `deepdetect dev read-teachers`, for a descriptor with `crops`.
+        places: folder of real photographs for a matcher, with the folders `fixed` and `moving`.
+            Each has a folder per place, with photographs of a fixed camera, or from several
+            viewpoints.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
         num_workers: number of processes that generate pairs; with 0, the training process does it.
             None: 0, or for a descriptor on a GPU, one less than the number of processors. A match
@@ -155,6 +165,13 @@ def train_on_pairs(
         from .points.task import RankerTrainer
 
         trainer = RankerTrainer(*files, options, num_workers or 0)
+    elif isinstance(options, MatcherTrainingOptions):
+        from .matcher.task import MatcherTrainer
+
+        where_taken = None if places is None else Path(places)
+        trainer = MatcherTrainer(
+            *files, options, Path(output), where_taken, init_weights, log is None
+        )
     else:
         from .match_filter import MatchFilterTrainer
 

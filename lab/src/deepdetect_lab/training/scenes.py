@@ -200,11 +200,15 @@ class Pose:
 
 
 def draw_layers(
-    rng: np.random.Generator, files: Sequence[Path], side_px: int = SIDE_PX
+    rng: np.random.Generator,
+    files: Sequence[Path],
+    side_px: int = SIDE_PX,
+    shift_px: float = SHIFT_DEVIATION,
 ) -> tuple[list[Layer], list[float], float]:
     """Draw a scene: its layers from back to front, the scales of the two views, and their rotation.
 
-    The rotation is the absolute angle between the two views, in radians.
+    The rotation is the absolute angle between the two views, in radians. The middles of the views
+    differ by random shifts with a standard deviation of `shift_px`.
     """
     photograph = _draw_photograph(rng, files)
     middle = np.array(photograph.shape[1::-1]) / 2 + rng.uniform(-OFFSET_PX, OFFSET_PX, 2)
@@ -219,7 +223,7 @@ def draw_layers(
     )
     first = Pose(middle, scales[0], angles[0], 1 + FIRST_TILT * rng.random())
     matrix = first.draw_matrix(rng, side_px, FIRST_PERSPECTIVE)
-    moved = middle + rng.normal(0, SHIFT_DEVIATION, 2) * scales[0]
+    moved = middle + rng.normal(0, shift_px, 2) * scales[0]
     relief = _draw_relief(rng, side_px) if happens(rng, RELIEF_SHARE) else None
     second = Pose(moved, scales[1], sum(angles), math.exp(log_tilt))
     views = View(matrix, None, side_px), View(second.draw_matrix(rng, side_px), relief, side_px)

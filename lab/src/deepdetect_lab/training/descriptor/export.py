@@ -38,7 +38,7 @@ def export_descriptor(network: DescriptorNetwork, path: Path) -> None:
     inputs = {"luma": luma, "xy": torch.ones(2, 50, 2), "sizes": torch.ones(2, 50)}
     axes = {name: {0: "batch", 1: "keypoints"} for name in ("xy", "sizes", "descriptors")}
     axes["luma"] = {0: "batch", 2: "height", 3: "width"}
-    model = to_onnx(network, inputs, "descriptors", axes)
+    model = to_onnx(network, inputs, ("descriptors",), axes)
     graph = model.graph
     for kernel in [each for each in graph.initializer if math.prod(each.dims) > MIN_HALVED]:
         values = onnx.numpy_helper.to_array(kernel).astype(np.float16)

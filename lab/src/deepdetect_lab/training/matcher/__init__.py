@@ -1,0 +1,1 @@
+"""Training of the matcher: a network that matches keypoints by attention."""
