@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import copy
-import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import torch
 from torch import nn
@@ -16,12 +14,8 @@ from torch.nn.utils.fusion import fuse_linear_bn_eval
 from deepdetect._shared.atomic import atomic_path
 from deepdetect.detector.points.descriptor import STRIDE
 
-from ...networks.export import to_onnx
+from ...networks.export import halve_weights, to_onnx
 from .network import DescriptorNetwork
-
-MIN_HALVED = 1000
-"""Kernels with more values than this are stored as float16, which halves the file. The graph
-converts them to float32 before it computes with them. Chosen by hand."""
 
 
 def export_descriptor(network: DescriptorNetwork, path: Path) -> None:
@@ -39,13 +33,6 @@ def export_descriptor(network: DescriptorNetwork, path: Path) -> None:
     axes = {name: {0: "batch", 1: "keypoints"} for name in ("xy", "sizes", "descriptors")}
     axes["luma"] = {0: "batch", 2: "height", 3: "width"}
     model = to_onnx(network, inputs, ("descriptors",), axes)
-    graph = model.graph
-    for kernel in [each for each in graph.initializer if math.prod(each.dims) > MIN_HALVED]:
-        values = onnx.numpy_helper.to_array(kernel).astype(np.float16)
-        halved = onnx.numpy_helper.from_array(values, f"{kernel.name}_float16")
-        cast = onnx.helper.make_node("Cast", [halved.name], [kernel.name], to=1)  # float32
-        graph.node.insert(0, cast)
-        graph.initializer.remove(kernel)
-        graph.initializer.append(halved)
+    halve_weights(model)
     with atomic_path(path) as temporary:
         onnx.save(model, temporary)

@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax, logsigmoid, softmax
 
 from deepdetect._shared.atomic import atomic_path
+from deepdetect.matching.attention import OUTPUTS
 
-from ...networks.export import to_onnx
+from ...networks.export import halve_weights, to_onnx
 
 WIDTH, LAYERS = 96, 3
 """Numbers per keypoint, and layers: those of the weights with which the training started. Matching
@@ -23,8 +24,6 @@ WIDTH, LAYERS = 96, 3
 
 DESCRIPTOR, TRAITS = 64, 4
 """Numbers of a learned descriptor, and of the further traits of a keypoint."""
-
-OUTPUTS = "partners", "probabilities", "back"
 
 
 class Mixer(nn.Module):
@@ -71,7 +70,7 @@ class Layer(nn.Module):
 class Matcher(nn.Module):
     """A network that returns, for all pairs of keypoints, the logarithm of the match probability.
 
-    Its inputs are those of `deepdetect.features.attention.attention_inputs`.
+    Its inputs are those of `deepdetect.matching.attention.attention_inputs`.
     """
 
     def __init__(self) -> None:
@@ -140,5 +139,7 @@ def export_matcher(network: Matcher, path: Path) -> None:
         for name, width in (("xy", 2), ("descriptors", DESCRIPTOR), ("traits", TRAITS)):
             inputs[name + side], axes[name + side] = torch.rand(count, width), {0: axis}
     axes["back"] = {0: "second"}
+    model = to_onnx(_Partners(network), inputs, OUTPUTS, axes)
+    halve_weights(model)
     with atomic_path(path) as temporary:
-        onnx.save(to_onnx(_Partners(network), inputs, OUTPUTS, axes), temporary)
+        onnx.save(model, temporary)

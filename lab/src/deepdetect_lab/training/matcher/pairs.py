@@ -24,11 +24,11 @@ from deepdetect._shared.opencv import cv2
 from deepdetect._shared.progress import progress
 from deepdetect._shared.records import load_arrays, save_arrays
 from deepdetect.detector.point_detector import PointDetector
-from deepdetect.features.attention import attention_inputs
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.images import downscale
 from deepdetect.geometry.transforms import transform_points
 from deepdetect.io.image import find_images, load_image
+from deepdetect.matching.attention import attention_inputs
 
 from ..descriptor.views import photograph_view
 from ..scenes import correspond, draw_layers, draw_until_seen, render_layers

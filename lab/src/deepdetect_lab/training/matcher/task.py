@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 from torch.utils.data import DataLoader, Dataset
 
-from deepdetect.features.attention import MIN_PROBABILITY
+from deepdetect.matching.attention import MIN_PROBABILITY
 
 from ...networks.weights import load_network
 from ..recipe import MatcherTrainingOptions

@@ -14,39 +14,54 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.errors import OptionError
-from .keypoints import Keypoints
-from .learned import LEARNED, UPRIGHT_DEGREES, match_turned, ratio_limit, turn_descriptors
-from .matchers import DescriptorMatches, exact_neighbours, match_descriptors, session_of
+from ..detector.backends import RuntimeOptions, open_graph
+from ..detector.backends.interface import run_graph
+from ..features.keypoints import Keypoints
+from ..features.learned import (
+    LEARNED,
+    UPRIGHT_DEGREES,
+    match_turned,
+    ratio_limit,
+    turn_descriptors,
+)
+from ..features.matchers import DescriptorMatches, exact_neighbours, match_descriptors
 
 ATTENTION = Path(__file__).with_name("attention.onnx")
 
-MIN_PROBABILITY = 0.1
+OUTPUTS = "partners", "probabilities", "back"
+
+MIN_PROBABILITY = 0.3
 """Matches of a lower probability are left out."""
 
 MEAN_LOG_SIZE = 2.5
 """Approximate mean of the logarithm of keypoint sizes in pixels; the network reads deviations."""
 
 
-def require_attention(features0: Keypoints, features1: Keypoints) -> None:
-    """Raise an OptionError if keypoints lack what the network reads."""
-    for features in (features0, features1):
-        known = features.sizes is not None and features.angles is not None
-        if features.descriptor_type != LEARNED or not known:
-            raise OptionError(
-                "`filter_by='attention'` needs keypoints with sizes, angles and descriptors of the "
-                f"type '{LEARNED}', as `PointDetector.extract` returns them: use 'ratio'"
-            )
+def match_by_attention(
+    features0: Keypoints,
+    features1: Keypoints,
+    runtime: RuntimeOptions = RuntimeOptions(),
+    least: float = MIN_PROBABILITY,
+) -> DescriptorMatches:
+    """Match keypoints one to one; `ratios` are the probabilities that matches are wrong.
 
-
-def match_by_attention(features0: Keypoints, features1: Keypoints) -> DescriptorMatches:
-    """Match keypoints one to one; `ratios` are the probabilities that matches are wrong."""
+    Matches with a probability below `least` are left out. The network needs memory for several
+    numbers per pair of keypoints.
+    """
     if not (len(features0) and len(features1)):
         none = np.empty(0, np.int32)
         return DescriptorMatches(none, none, np.empty(0, np.float32))
     inputs = attention_inputs(features0, features1)
-    partners, probabilities, back = session_of(ATTENTION).run(None, inputs)
+    what = f"{len(features0):,} x {len(features1):,} keypoints"
+    try:
+        found = run_graph(open_graph(ATTENTION, runtime), OUTPUTS, inputs, what)
+    except MemoryError:
+        raise OptionError(
+            f"there is not enough memory to match {what} by attention: use fewer keypoints"
+        ) from None
+    partners, probabilities, back = found
     mutual = back[partners] == np.arange(len(partners))
-    rows = np.flatnonzero(mutual & (probabilities > MIN_PROBABILITY)).astype(np.int32)
+    rows = np.flatnonzero(mutual & (probabilities > least)).astype(np.int32)
     return DescriptorMatches(rows, partners[rows].astype(np.int32), 1 - probabilities[rows])
 
 
