@@ -43,7 +43,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         _clear(final.parent.absolute())
         final.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch(exist_ok=False)  # other processes may remove an empty folder
+        temporary.touch(exist_ok=False)  # at once, because others may remove the folder as empty
         yield temporary
         temporary.replace(final)
     except DeepDetectError:  # MissingFileError is also an OSError

@@ -52,7 +52,7 @@ def _read(image, x, y, a, b, c, d, radius, cubic, values):  # type: ignore[no-un
 
 @compiled(nogil=True, fastmath=True)
 def _inverted(matrix, inverse, size):  # type: ignore[no-untyped-def]
-    """Write a positive definite matrix's inverse (Gauss-Jordan), overwriting the matrix."""
+    """Write the inverse of a positive definite `matrix` to `inverse`; the matrix is destroyed."""
     for row in range(size):
         for column in range(size):
             inverse[row, column] = 1.0 if row == column else 0.0

@@ -47,9 +47,9 @@ epipole if it is within MAX_EPIPOLE_DISTANCE_PX of the line from the epipole to 
 the homography predicts. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_FRACTION_OF_PLANE, MIN_FRACTION_OF_REST = 0.2, 0.5
-"""A scene has depth if the matches that agree on an epipole number at least MIN_FRACTION_OF_PLANE
-of those on the plane (moved objects give fewer) and MIN_FRACTION_OF_REST of those off the plane.
-Chosen like `MIN_PARALLAX_PX`."""
+"""A scene has depth if the number of matches that agree with one epipole is at least
+MIN_FRACTION_OF_PLANE times that on the plane (moved objects give fewer), and MIN_FRACTION_OF_REST
+times that off the plane. Chosen like `MIN_PARALLAX_PX`."""
 
 MAX_MATCHES, SAMPLES = 2000, 1000
 """`measure_parallax` draws at most MAX_MATCHES matches off the plane, and SAMPLES epipoles, each

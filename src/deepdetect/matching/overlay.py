@@ -213,7 +213,8 @@ def _contradicted(
     stays = np.linalg.norm(ends - places, axis=1) <= MAX_STILL_PX
     scene = scene & ~stays
     cells, moving_cells = (len(np.unique(places[k] // CELL_PX, axis=0)) for k in (stays, scene))
-    # If still matches fill more of the image than moving ones, a still camera sees a moving object.
+    # If unmoved matches cover more of the image than moved ones, the camera stands still, and an
+    # object moves.
     if np.count_nonzero(scene) < NEIGHBOURS or (cells > moving_cells and not moves):
         return nowhere
     size = still.shape[::-1]

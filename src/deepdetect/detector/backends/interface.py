@@ -71,7 +71,10 @@ def run_graph(
 
 
 class OnnxNetwork:
-    """A network in a session. `onnx_path` is None if the network cannot run in tiles."""
+    """A network that a session of a runtime runs.
+
+    `onnx_path` is its file, of which tiles run parts; None if it cannot run in tiles.
+    """
 
     def __init__(self, session: Session, path: Path, options: RuntimeOptions) -> None:
         self._session, self._path, self.threads = session, path, options.threads

@@ -124,9 +124,9 @@ def rank_candidates(
 
 
 def candidate_angles(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
-    """Return the dominant orientations of candidates, (N,) float32 degrees, as SIFT's.
+    """Return the dominant orientation of each candidate, computed as in SIFT: (N,) float32 degrees.
 
-    Gradients are those of the next coarser level than the candidate's own.
+    The gradients are those of the level that is one step coarser than the candidate's.
     """
     from ...features.kernels import strongest_directions
 

@@ -170,7 +170,7 @@ def _validated(starts: np.ndarray, ends: np.ndarray, side_px: float) -> bool:
 
 
 def _misfit(expected: np.ndarray, ends: np.ndarray) -> float:
-    """Return the mean squared error of (N, 2) tracks, of which each counts at most `NOISE_PX`."""
+    """Return the mean squared error of (N, 2) tracks, after errors are limited to `NOISE_PX`."""
     return float(np.minimum(((ends - expected) ** 2).sum(axis=1), NOISE_PX**2).mean())
 
 

@@ -52,8 +52,8 @@ disparities are searched in reduced copies, to bound time and memory. They are t
 rectified images themselves."""
 
 MAX_STEP_PX = 4.0
-"""If the search steps are coarser than this, disparities near the plane of a known homography are
-also searched alone, in finer steps. The result with more matches is kept."""
+"""If the search steps are coarser than this, a second search covers only the disparities near the
+plane of a known homography, in finer steps. The result with more matches is kept."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """The range of disparities is extended at both ends by MARGIN_PX plus MARGIN_FRACTION of its

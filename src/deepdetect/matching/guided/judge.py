@@ -49,9 +49,10 @@ DIMENSIONS = 64
 those of the first image, so that correlations take a quarter of the time."""
 
 FALSE_POSITIVE_RATE, CONTRADICTING_RATE = 0.01, 0.05
-"""A geometry explains a cell (a descriptor, 4 px from the next) if under FALSE_POSITIVE_RATE of the
-cells of copies displaced by `FAR` correlate as well. It contradicts a cell if CONTRADICTING_RATE or
-more of those have surroundings that correlate as well as the cell's surroundings. Set by hand."""
+"""The correlation of a cell under a geometry is compared with those of all cells in copies of the
+second image that are shifted by `FAR`. The geometry explains the cell if less than the fraction
+FALSE_POSITIVE_RATE of these are as high. It contradicts the cell if, of the mean correlations
+around cells, CONTRADICTING_RATE or more are as high as that around the cell. Set by hand."""
 
 FAR = ((1 / 4, 0), (0, 1 / 4), (1 / 3, 1 / 3), (1 / 3, -1 / 3))
 """The second image shifted by plus or minus these fractions of its width and height gives the

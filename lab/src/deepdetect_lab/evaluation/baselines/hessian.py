@@ -63,7 +63,7 @@ HESSIAN: dict[str, LocalFeature] = {
         title,
         detect,
         PAPER_DESCRIPTOR.describe,
-        own_scale=OwnScaleDescriptor(0.5),  # a size of 2.5 sigma is near SIFT's 2 sigma
+        own_scale=OwnScaleDescriptor(0.5),  # as for SIFT: both sizes are about twice the sigma
     )
     for name, title, detect in (
         ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),

@@ -32,7 +32,8 @@ FAR_SCALE = Effect(0.4, math.log(0.4), math.log(2.4))
 the network learns the same descriptors at any scale."""
 
 ATTEMPTS = 50
-"""Number of photographs to try per crop, because some have no reading. Chosen by hand."""
+"""Number of photographs to try per crop, because some have no stored outputs of
+the teachers. Chosen by hand."""
 
 
 class Crops(NamedTuple):

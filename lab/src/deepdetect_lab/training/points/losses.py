@@ -21,8 +21,8 @@ SHARPNESS = 25.0
 larger logits alone do not lower the loss. `TEMPERATURE` was chosen for this value."""
 
 TEMPERATURE = 0.6
-"""Temperature of the sigmoid of scaled logits. After 1,000 steps, the score on photos/val was 0.560
-with 0.6, and 0.546 to 0.552 with 0.15, 0.3, 1, 1.5 and 3 (lab/HISTORY.md)."""
+"""Temperature of the sigmoid of scaled logits. After 1,000 steps, the repeatability on photos/val
+was 0.560 with 0.6, and 0.546 to 0.552 with 0.15, 0.3, 1, 1.5 and 3 (lab/HISTORY.md)."""
 
 CLOSE_SHARE = 0.7
 """A keypoint gets this share of its reward only if it is found again within `CLOSE_PX`. It gets the
