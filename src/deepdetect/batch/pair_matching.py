@@ -48,8 +48,7 @@ class PairMatchingOptions:
             fraction of the distance to the second-nearest. None: the default of `match_features`.
         mutual: keep only mutual nearest neighbours.
         filter_by: which nearest neighbours are matches: those that pass the ratio test ("ratio"),
-            or that move as the matches around them do ("neighbours"); or, in their place, what a
-            network matches that compares all keypoints ("attention").
+            or that move as the matches around them do ("neighbours").
         matcher: name of the matcher: "auto", "exact", "patchmatch" or "flann".
         verify: keep only the inliers of a geometry that is estimated from the matches:
             "fundamental", "homography" or "auto". None keeps all matches.
@@ -62,7 +61,7 @@ class PairMatchingOptions:
 
     ratio: float | None = None
     mutual: bool = True
-    filter_by: Literal["ratio", "neighbours", "attention"] = "ratio"
+    filter_by: Literal["ratio", "neighbours"] = "ratio"
     matcher: str = "auto"
     verify: str | None = None
     inlier_threshold: float = GeometryOptions.inlier_threshold
@@ -100,7 +99,7 @@ def match_pairs(
     - `matches0` (N0,) int32: for each keypoint of the first image, the index of its match among the
       keypoints of the second image, or -1 if it has no match.
     - `matching_scores0` (N0,) float32 in [0, 1]: 1 minus the distance ratio of Lowe's test or, with
-      another `filter_by`, the probability that the match is correct.
+      `filter_by="neighbours"`, the probability that the match is correct.
 
     If `pairs` is a word such as "exhaustive", the pairs are also listed in the file PATH.pairs.txt,
     which hloc needs.
@@ -141,8 +140,8 @@ def match_pairs(
         list_pairs(pairs, ())  # raises an error for wrong pairs before long work
     if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: write the matches to another file with -o")
-    if options.filter_by != "ratio" and (first := first_keypoints(source)):
-        require_suited(options.filter_by, first)
+    if options.filter_by == "neighbours" and (first := first_keypoints(source)):
+        require_suited(first)
     with open_hdf5(source) as file:
         names = natsorted(feature_names(file), alg=ns.PATH)
     if alike:

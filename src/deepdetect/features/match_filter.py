@@ -16,7 +16,7 @@ import numpy as np
 from .._shared.errors import OptionError, check_name
 from .._shared.opencv import cv2
 from .keypoints import Keypoints
-from .learned import CROSS_MODAL, LEARNED, UPRIGHT_DEGREES, common_turn, is_learned
+from .learned import CROSS_MODAL, UPRIGHT_DEGREES, common_turn, is_learned
 from .matchers import DescriptorMatches, session_of
 from .sift import ROOT_SIFT
 
@@ -32,9 +32,9 @@ FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
 
 def check_filter(filter_by: str, ratio: float | None, mutual: bool) -> None:
     """Raise an OptionError if `filter_by` is unknown, or if the other options contradict it."""
-    check_name("filter_by", filter_by, ("ratio", "neighbours", "attention"))
-    if filter_by != "ratio" and (ratio is not None or not mutual):
-        raise OptionError(f"`filter_by='{filter_by}'` needs `mutual=True` and no `ratio`")
+    check_name("filter_by", filter_by, ("ratio", "neighbours"))
+    if filter_by == "neighbours" and (ratio is not None or not mutual):
+        raise OptionError("`filter_by='neighbours'` needs `mutual=True` and no `ratio`")
 
 
 def suits_filter(features: Keypoints) -> bool:
@@ -50,18 +50,12 @@ def suits_filter(features: Keypoints) -> bool:
     return bool((sizes > 0).all() and (angles >= 0).all())
 
 
-def require_suited(filter_by: str, *features: Keypoints) -> None:
-    """Raise an OptionError if keypoints do not suit the network that `filter_by` names, if any."""
-    if filter_by == "ratio":
-        return
-    by_attention = filter_by == "attention"
-    kinds = [LEARNED] if by_attention else {each.descriptor_type for each in features}
-    if not all(suits_filter(each) and each.descriptor_type in kinds for each in features):
-        served = f"descriptors of the type '{LEARNED}'"
+def require_suited(*features: Keypoints) -> None:
+    """Raise an OptionError if keypoints do not suit the filter."""
+    if not all(map(suits_filter, features)):
         raise OptionError(
-            f"`filter_by='{filter_by}'` needs keypoints with sizes and angles, and "
-            f"{served if by_attention else 'learned descriptors or RootSIFT'}, as "
-            "`PointDetector.extract` returns them: use 'ratio'"
+            "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "
+            "descriptors or RootSIFT, as `PointDetector.extract` returns them: use 'ratio'"
         )
 
 

@@ -32,7 +32,6 @@ from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, at_pixels, load_pair
 from ..io.projection import require_pinhole
-from .attention import match_by_attention
 from .by_graph import match_by_graph
 from .guided import Explanation, ImagePair
 from .overlay import scene_of, still_matches, tell_still
@@ -138,7 +137,7 @@ def match_features(
     features1: Keypoints,
     *,
     matcher: str = "auto",
-    filter_by: Literal["ratio", "neighbours", "attention"] = "ratio",
+    filter_by: Literal["ratio", "neighbours"] = "ratio",
     ratio: float | None = None,
     mutual: bool = True,
     seed: int = 0,
@@ -155,9 +154,7 @@ def match_features(
             test; with "neighbours", a small network keeps those that move, rotate and scale as the
             matches around them. This gives more correct and fewer wrong matches than "ratio", but
             needs at least nine mutual neighbours, learned descriptors (not cross-modal) or
-            RootSIFT, and keypoints with sizes and angles. With "attention", a larger network
-            compares all keypoints, which finds most between unlike views, but takes half a second
-            for 2,048 keypoints and four times as long for twice as many.
+            RootSIFT, and keypoints with sizes and angles.
         ratio: maximum ratio of the descriptor distances to the nearest and the second-nearest
             neighbour. None: 0.91 for "learned", 0.9 for "cross-modal", 0.88 if otherwise learned,
             0.85 for all others. These limits are equally strict.
@@ -168,7 +165,7 @@ def match_features(
 
     Returns:
         The matches, without a geometry (see `estimate_geometry`). Their scores are 1 - ratio or,
-        with "neighbours" and "attention", the network's probabilities that the match is correct.
+        with "neighbours", the network's probabilities, above 0.5, that the match is correct.
 
     Raises:
         OptionError: an option is unknown, out of its range, or incompatible with the others; or
@@ -195,17 +192,13 @@ def match_features(
     learned = is_learned(features0.descriptor_type)
     check_filter(filter_by, ratio, mutual)
     by_neighbours = filter_by == "neighbours"
-    require_suited(filter_by, features0, features1)
+    if by_neighbours:
+        require_suited(features0, features1)
     if ratio is None:
         ratio = ratio_limit(features0.descriptor_type)
     if not 0 < ratio <= 1:
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
     check_memory([len(features0), len(features1)])
-    if filter_by == "attention":
-        if matcher != "auto":
-            raise OptionError("`filter_by='attention'` searches no neighbours: leave `matcher` out")
-        found = match_by_attention(features0, features1, RuntimeOptions(backend, device))
-        return _matches_of(features0, features1, found)
     alike = features0.sizes is None and features1.sizes is None  # keypoints share scale and angle
     limits: dict[str, Any] = {"ratio": math.inf if by_neighbours else ratio, "mutual": mutual}
     nearest: Callable[[np.ndarray, np.ndarray], DescriptorMatches] = partial(
@@ -230,10 +223,6 @@ def match_features(
         matches = match_learned(features0, features1, match)
     else:
         matches = match(features0.descriptors, features1.descriptors)
-    return _matches_of(features0, features1, matches)
-
-
-def _matches_of(features0: Keypoints, features1: Keypoints, matches: DescriptorMatches) -> Matches:
     return Matches(
         features0.xy[matches.indices0],
         features1.xy[matches.indices1],

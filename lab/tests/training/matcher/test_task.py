@@ -7,10 +7,9 @@ import onnxruntime
 import pytest
 import torch
 
-from deepdetect.matching.attention import OUTPUTS
 from deepdetect_lab.training import MatcherTrainingOptions
 from deepdetect_lab.training.matcher import task
-from deepdetect_lab.training.matcher.network import Matcher, export_matcher
+from deepdetect_lab.training.matcher.network import OUTPUTS, Matcher, export_matcher
 from deepdetect_lab.training.matcher.pairs import NONE, UNKNOWN, Pair
 from deepdetect_lab.training.matcher.task import MatcherTrainer, as_tensors, loss_of, vary
 

@@ -23,7 +23,6 @@ from ...geometry.refinement import refine_fundamental
 from ...geometry.transforms import epipolar_errors, scaled_points, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model
 from ...io.image import MINIMUM_SIDE
-from ..attention import match_by_attention
 from .image_pair import ImagePair, Pair
 from .simulated_views import simulated_views
 
@@ -47,10 +46,6 @@ TENTATIVE_RATIO = 0.95
 geometry is later compared with the pixels. On the ten pairs of the data set `wide`, with wide
 baselines or changes of light, limits of 0.91, 0.93, 0.94, 0.95 and 0.97 give an mAA at 10 px of
 0.38, 0.44, 0.36, 0.47 and 0.43."""
-
-TENTATIVE_PROBABILITY = 0.02
-"""Matches by attention are tentative from this probability on, lower than in `match_features`, for
-the same reason as TENTATIVE_RATIO."""
 
 SEPARATION_PX = 2.0
 """Only one match per square of this side is kept in each image, in pixels of the reduced images,
@@ -139,7 +134,6 @@ class Sources:
         if self._given is not None:
             yield self._of_positions(self._given)
         yield self.learned
-        yield self._attended()
         yield self.dense
         yield self._cross_modal()
         yield self._views()
@@ -148,13 +142,6 @@ class Sources:
     def learned(self) -> Tentative:
         """Matches of learned points in copies whose longer side is `LEARNED_SIDE_PX`."""
         return self._matched(self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS), LEARNED_SIDE_PX)
-
-    def _attended(self) -> Tentative:
-        """Match the same points by attention."""
-        points = self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS)
-        found = match_by_attention(*points, least=TENTATIVE_PROBABILITY)
-        ends = (points[0].xy[found.indices0], points[1].xy[found.indices1])
-        return self._at_full_size(ends, LEARNED_SIDE_PX)
 
     def _extract(self, side_px: int, keypoints: int) -> tuple[Keypoints, Keypoints]:
         pair = self._pair
@@ -168,15 +155,10 @@ class Sources:
         return first, second
 
     def _matched(self, points: tuple[Keypoints, Keypoints], side_px: int) -> Tentative:
-        points0, points1, _ = matched_points(*points)
-        return self._at_full_size((points0, points1), side_px)
-
-    def _at_full_size(self, ends: Pair, side_px: int) -> Tentative:
         (scale0, scale1) = self._pair.both(side_px)[1]
-        points0, points1 = separate(*(each.astype(np.float64) for each in ends))
-        return Tentative(
-            scaled_points(points0, 1 / scale0), scaled_points(points1, 1 / scale1), 1 / scale1
-        )
+        points0, points1, _ = matched_points(*points)
+        ends = scaled_points(points0, 1 / scale0), scaled_points(points1, 1 / scale1)
+        return Tentative(*ends, 1 / scale1)
 
     def _cross_modal(self) -> Tentative:
         views, _ = self._pair.both(LEARNED_SIDE_PX)

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax, logsigmoid, softmax
 
 from deepdetect._shared.atomic import atomic_path
-from deepdetect.matching.attention import OUTPUTS
 
 from ...networks.export import halve_weights, to_onnx
 
@@ -24,6 +23,11 @@ WIDTH, LAYERS = 96, 3
 
 DESCRIPTOR, TRAITS = 64, 4
 """Numbers of a learned descriptor, and of the further traits of a keypoint."""
+
+
+OUTPUTS = "partners", "probabilities", "back"
+"""Outputs of the ONNX file: the likeliest partner of each keypoint of the first image and its
+probability, and the likeliest partner of each keypoint of the second image."""
 
 
 class Mixer(nn.Module):
@@ -70,7 +74,7 @@ class Layer(nn.Module):
 class Matcher(nn.Module):
     """A network that returns, for all pairs of keypoints, the logarithm of the match probability.
 
-    Its inputs are those of `deepdetect.matching.attention.attention_inputs`.
+    Its inputs are those of `attention_inputs`.
     """
 
     def __init__(self) -> None:
@@ -133,7 +137,7 @@ def turned(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
 
 
 def export_matcher(network: Matcher, path: Path) -> None:
-    """Write the network as an ONNX file, which `match_by_attention` reads."""
+    """Write the network as an ONNX file, whose inputs are those of `attention_inputs`."""
     inputs, axes = {}, {"partners": {0: "first"}, "probabilities": {0: "first"}}
     for side, count, axis in (("0", 5, "first"), ("1", 7, "second")):
         for name, width in (("xy", 2), ("descriptors", DESCRIPTOR), ("traits", TRAITS)):

@@ -28,11 +28,11 @@ from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.images import downscale
 from deepdetect.geometry.transforms import transform_points
 from deepdetect.io.image import find_images, load_image
-from deepdetect.matching.attention import attention_inputs
 
 from ..descriptor.views import photograph_view
 from ..scenes import correspond, draw_layers, draw_until_seen, render_layers
 from ..synthetic import WHITE, happens, rotation, scaled_along, view_homography
+from .inputs import attention_inputs
 
 KEYPOINTS, MIN_KEYPOINTS = 1024, 80
 """Images have at most KEYPOINTS and at least MIN_KEYPOINTS keypoints. Chosen by hand."""
