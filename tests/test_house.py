@@ -20,7 +20,7 @@ MAX_OPTION_CLASSES = 30
 MAX_KEYWORDS = 12
 MAX_ROOT_NAMES = 32
 
-MAX_CORE_LINES = 31_958
+MAX_CORE_LINES = 31_964
 """Lines of Python in src/deepdetect; an issue that brings an ability may raise it, nothing else."""
 
 MAX_FUNCTION_LINES = 120

@@ -70,15 +70,6 @@ def match_learned(
     features0: Keypoints,
     features1: Keypoints,
     match: Callable[[np.ndarray, np.ndarray], DescriptorMatches],
-) -> DescriptorMatches:
-    """Match learned descriptors after undoing the rotation between the two images."""
-    return match_turned(features0, features1, match)[0]
-
-
-def match_turned(
-    features0: Keypoints,
-    features1: Keypoints,
-    match: Callable[[np.ndarray, np.ndarray], DescriptorMatches],
 ) -> tuple[DescriptorMatches, float]:
     """Match learned descriptors; return also the undone rotation between the images, in degrees.
 

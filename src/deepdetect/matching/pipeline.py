@@ -220,7 +220,7 @@ def match_features(
         return filter_matches(features0, features1, found) if by_neighbours else found
 
     if learned:
-        matches = match_learned(features0, features1, match)
+        matches, _ = match_learned(features0, features1, match)
     else:
         matches = match(features0.descriptors, features1.descriptors)
     return Matches(

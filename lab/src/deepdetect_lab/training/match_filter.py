@@ -214,7 +214,7 @@ def mutual_matches(features0: Keypoints, features1: Keypoints) -> DescriptorMatc
     """Match descriptors by mutual nearest neighbours, without a ratio test."""
     match = partial(match_descriptors, matcher=exact_neighbours, ratio=math.inf, mutual=True)
     if features0.descriptor_type == LEARNED:
-        return match_learned(features0, features1, match)
+        return match_learned(features0, features1, match)[0]
     assert features0.descriptors is not None
     assert features1.descriptors is not None
     return match(features0.descriptors, features1.descriptors)

@@ -228,7 +228,7 @@ def matched_points(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...
     ratio = TENTATIVE_RATIO if kind in (LEARNED, CROSS_MODAL) else ratio_limit(kind)
     match = partial(match_descriptors, matcher=exact_neighbours, ratio=ratio, mutual=True)
     if is_learned(first.descriptor_type):
-        matches = match_learned(first, second, match)
+        matches, _ = match_learned(first, second, match)
     else:
         matches = match(first.descriptors, second.descriptors)
     points = first.xy[matches.indices0], second.xy[matches.indices1]

@@ -10,7 +10,7 @@ from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.learned import (
     LEARNED,
     UPRIGHT_DEGREES,
-    match_turned,
+    match_learned,
     ratio_limit,
     turn_descriptors,
 )
@@ -30,7 +30,7 @@ def attention_inputs(features0: Keypoints, features1: Keypoints) -> dict[str, np
     match = partial(
         match_descriptors, matcher=exact_neighbours, ratio=ratio_limit(LEARNED), mutual=True
     )
-    turn = (match_turned(features0, features1, match)[1] + 180) % 360 - 180
+    turn = (match_learned(features0, features1, match)[1] + 180) % 360 - 180
     turn = 0.0 if abs(turn) < UPRIGHT_DEGREES else turn
     inputs: dict[str, np.ndarray] = {}
     for number, (features, degrees) in enumerate(((features0, 0.0), (features1, turn))):
