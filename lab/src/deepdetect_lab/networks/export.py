@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import math
 import warnings
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -31,10 +30,6 @@ from deepdetect.detector.pretrained import LOGITS, PADDED_IMAGE, PADDED_LOGITS, 
 
 OPSET = 17
 """Version of the ONNX operator set. ONNX Runtime 1.24, OpenVINO and OpenCV 4 can all read it."""
-
-MIN_HALVED = 1000
-"""Tensors with more values than this are stored as float16, which halves files of descriptors and
-matchers. Chosen by hand."""
 
 _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
 """Shape by node type in which factors, one for each output channel, multiply a kernel."""
@@ -68,18 +63,6 @@ def to_onnx(
             training=training,
         )
     return onnx.load_model_from_string(written.getvalue())
-
-
-def halve_weights(model: onnx.ModelProto) -> None:
-    """Store the large tensors of a graph as float16; the graph converts them to float32 first."""
-    graph = model.graph
-    for kernel in [each for each in graph.initializer if math.prod(each.dims) > MIN_HALVED]:
-        values = numpy_helper.to_array(kernel).astype(np.float16)
-        halved = numpy_helper.from_array(values, f"{kernel.name}_float16")
-        cast = helper.make_node("Cast", [halved.name], [kernel.name], to=onnx.TensorProto.FLOAT)
-        graph.node.insert(0, cast)
-        graph.initializer.remove(kernel)
-        graph.initializer.append(halved)
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import copy
+import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnx
 import torch
+from onnx import helper, numpy_helper
 from torch import nn
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from deepdetect._shared.atomic import atomic_path
 from deepdetect.detector.points.descriptor import STRIDE
 
-from ...networks.export import halve_weights, to_onnx
+from ...networks.export import to_onnx
 from .network import DescriptorNetwork
+
+MIN_HALVED = 1000
+"""Tensors with more values than this are stored as float16, which halves files of descriptors and
+matchers. Chosen by hand."""
 
 
 def export_descriptor(network: DescriptorNetwork, path: Path) -> None:
@@ -36,3 +43,15 @@ def export_descriptor(network: DescriptorNetwork, path: Path) -> None:
     halve_weights(model)
     with atomic_path(path) as temporary:
         onnx.save(model, temporary)
+
+
+def halve_weights(model: onnx.ModelProto) -> None:
+    """Store the large tensors of a graph as float16; the graph converts them to float32 first."""
+    graph = model.graph
+    for kernel in [each for each in graph.initializer if math.prod(each.dims) > MIN_HALVED]:
+        values = numpy_helper.to_array(kernel).astype(np.float16)
+        halved = numpy_helper.from_array(values, f"{kernel.name}_float16")
+        cast = helper.make_node("Cast", [halved.name], [kernel.name], to=onnx.TensorProto.FLOAT)
+        graph.node.insert(0, cast)
+        graph.initializer.remove(kernel)
+        graph.initializer.append(halved)

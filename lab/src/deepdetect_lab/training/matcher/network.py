@@ -14,15 +14,17 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax, logsigmoid, softmax
 
 from deepdetect._shared.atomic import atomic_path
+from deepdetect.features.learned import LENGTH
 
-from ...networks.export import halve_weights, to_onnx
+from ...networks.export import to_onnx
+from ..descriptor.export import halve_weights
 
 WIDTH, LAYERS = 96, 3
 """Numbers per keypoint, and layers: those of the weights with which the training started. Matching
 2,048 by 2,048 keypoints takes about half a second on one processor."""
 
-DESCRIPTOR, TRAITS = 64, 4
-"""Numbers of a learned descriptor, and of the further traits of a keypoint."""
+TRAITS = 4
+"""Number of further traits of a keypoint."""
 
 
 OUTPUTS = "partners", "probabilities", "back"
@@ -79,9 +81,9 @@ class Matcher(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.descriptor = nn.Linear(DESCRIPTOR, WIDTH)
+        self.descriptor = nn.Linear(LENGTH, WIDTH)
         wide = 2 * WIDTH
-        self.adapted = nn.Sequential(nn.Linear(DESCRIPTOR, wide), nn.GELU(), nn.Linear(wide, WIDTH))
+        self.adapted = nn.Sequential(nn.Linear(LENGTH, wide), nn.GELU(), nn.Linear(wide, WIDTH))
         self.traits = nn.Linear(TRAITS, WIDTH, bias=False)
         self.place = nn.Linear(2, WIDTH // 2, bias=False)
         self.layers = nn.ModuleList(Layer() for _ in range(LAYERS))
@@ -140,7 +142,7 @@ def export_matcher(network: Matcher, path: Path) -> None:
     """Write the network as an ONNX file, whose inputs are those of `attention_inputs`."""
     inputs, axes = {}, {"partners": {0: "first"}, "probabilities": {0: "first"}}
     for side, count, axis in (("0", 5, "first"), ("1", 7, "second")):
-        for name, width in (("xy", 2), ("descriptors", DESCRIPTOR), ("traits", TRAITS)):
+        for name, width in (("xy", 2), ("descriptors", LENGTH), ("traits", TRAITS)):
             inputs[name + side], axes[name + side] = torch.rand(count, width), {0: axis}
     axes["back"] = {0: "second"}
     model = to_onnx(_Partners(network), inputs, OUTPUTS, axes)

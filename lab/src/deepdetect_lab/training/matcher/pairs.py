@@ -30,6 +30,7 @@ from deepdetect.geometry.transforms import transform_points
 from deepdetect.io.image import find_images, load_image
 
 from ..descriptor.views import photograph_view
+from ..match_filter import UNRELATED
 from ..scenes import correspond, draw_layers, draw_until_seen, render_layers
 from ..synthetic import WHITE, happens, rotation, scaled_along, view_homography
 from .inputs import attention_inputs
@@ -43,9 +44,6 @@ SIDE_PX, MAX_SIDE_PX = 512, 704
 SHIFT_PX = (15.0, 160.0)
 """The middles of two synthetic views differ by a random shift. Its standard deviation is drawn from
 this range, so that some pairs overlap in a small part only."""
-
-UNRELATED = 12
-"""Every twelfth synthetic pair shows two unrelated scenes. Chosen by hand."""
 
 NEAR_PX, FAR_PX = 3.0, 6.0
 """Keypoints of both images correspond if their places differ by less than NEAR_PX. A keypoint has
@@ -68,9 +66,6 @@ ZOOM, TILT, TURN, OFFSET, PERSPECTIVE = (0.6, 1.25), 0.25, 0.12, 0.2, 4e-4
 """Other photographs of fixed cameras are seen from another viewpoint: the range of the scale, the
 standard deviations of the logarithm of the tilt and of the angle in radians, the largest shift as a
 fraction of the sides, and the standard deviation of the perspective per pixel. Chosen by hand."""
-
-DENSE_MATCHES = 1500
-"""Two photographs of a place need this many guided matches of high confidence. Chosen by hand."""
 
 AROUND, AROUND_PX, MAX_DEVIATION_PX = 12, 8.0, 4.0
 """The place of a keypoint in the other photograph is predicted by an affinity of the AROUND nearest
@@ -229,8 +224,7 @@ def draw_moving(rng: np.random.Generator, places: Sequence[Path]) -> Pair | None
         matches = match_images(*drawn)
     except DeepDetectError:  # a panorama or a fisheye picture
         return None
-    sure = matches.geometry is not None and matches.geometry.confidence == "high"
-    if not sure or len(matches) < DENSE_MATCHES:
+    if matches.geometry is None or matches.geometry.confidence != "high":
         return None
     first, second = map(_extracted, drawn)
     if min(len(first), len(second)) < MIN_KEYPOINTS:

@@ -14,12 +14,15 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 from torch.utils.data import DataLoader, Dataset
 
+from deepdetect.features.learned import LENGTH
+
 from ...networks.weights import load_network
+from ..match_filter import VALIDATION_SEED
 from ..recipe import MatcherTrainingOptions
 from ..sampler import milestones
 from ..synthetic import happens, rotation
 from ..trainer import Trainer, digests, seeded, with_plateau
-from .network import DESCRIPTOR, Matcher, export_matcher
+from .network import Matcher, export_matcher
 from .pairs import NONE, UNKNOWN, Pair, draw_pairs, read_pair
 
 ONNX = "attention.onnx"
@@ -50,9 +53,6 @@ as in the data set `wide`."""
 MIN_PROBABILITY = 0.3
 """Validations count matches of at least this probability: at 0.3, they were as precise as those of
 the ratio test on HPatches and Oxford."""
-
-VALIDATION_SEED = 1
-"""Seed of the validation pairs. It is the same for all seeds of the training."""
 
 
 class PairDataset(Dataset[list[tuple[dict[str, Tensor], Tensor, Tensor]]]):
@@ -87,7 +87,7 @@ def vary(rng: np.random.Generator, pair: Pair) -> Pair:
         if noisy:
             described = inputs["descriptors"]
             if side:
-                mixing = rng.standard_normal((DESCRIPTOR, DESCRIPTOR), np.float32)
+                mixing = rng.standard_normal((LENGTH, LENGTH), np.float32)
                 described = described + mix * described @ mixing
             described = normalize(torch.from_numpy(described), dim=1).numpy()
             described = described + noise * rng.standard_normal(described.shape, np.float32)
