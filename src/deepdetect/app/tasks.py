@@ -66,7 +66,7 @@ class Order:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Result of a task: its figures as text by label, the file to show, the files to download."""
+    """Result of a task: its numbers as text by label, a file to show, files to download."""
 
     numbers: Mapping[str, str]
     shown: str

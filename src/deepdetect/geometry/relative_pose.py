@@ -263,9 +263,9 @@ def fit_to_lines(
 ) -> T:
     """Fit the parameters of a fundamental matrix, such as a pose, to (M, 2) matches (Cauchy loss).
 
-    Levenberg-Marquardt begins at `start`. `moved` adds a vector to the parameters, and the rows of
-    `axes` are its unit vectors. `matrix_of` computes the matrix. Errors of matches are divided by
-    `sigmas`, (M,) in pixels; `prior` returns deviations in units of their standard deviations.
+    Levenberg-Marquardt begins at `start`. `moved` changes parameters by a step; the rows of `axes`
+    are unit steps, one per degree of freedom. `matrix_of` computes the matrix. Errors of matches
+    are divided by `sigmas`, (M,) in pixels; `prior` returns deviations divided by their sigmas.
     """
     count, damping = len(points0), 1e-3
 

@@ -148,7 +148,7 @@ class _Points:
 
 
 def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int, list[int]]:
-    """Return, by image number, the numbers of the images with which it has verified matches."""
+    """Return, for each image, the images with which it has verified matches, all by number."""
     partners = defaultdict[int, list[int]](list)
     for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair)

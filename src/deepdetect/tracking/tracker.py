@@ -98,7 +98,7 @@ class Tracker:
     Args:
         detect: detects keypoints in a (H, W, 3) uint8 RGB image, as `PointDetector().detect` does.
         options: how points are followed.
-        ignore: (H, W) bool mask of the frames, or of larger copies, true where no point is kept.
+        ignore: (H, W) bool mask, true where no point is kept; larger masks are scaled down.
 
     Example:
         >>> grid = np.stack(np.meshgrid(range(10, 90, 10), range(10, 60, 10)), -1).reshape(-1, 2)

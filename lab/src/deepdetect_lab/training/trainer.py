@@ -133,7 +133,7 @@ class Trainer(abc.ABC):
         return read_notes(path)
 
     def export(self, folder: Path) -> Path | None:
-        """Write the best weights as an ONNX file; return its path, or None for a ranker."""
+        """Write the best weights as an ONNX file; return its path, or None if there is none."""
         return None
 
     def training_step(self, batch: Any, step: int) -> float:

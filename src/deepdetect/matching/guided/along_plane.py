@@ -45,9 +45,9 @@ MIN_TRACKS, SQUARES = 15, 8
 divided into squares, SQUARES along its longer side, of four colours. Chosen by hand."""
 
 MAX_PARALLAX = 0.15
-"""A tentative match is not tracked if it ends farther than this fraction of the longer side from
-where the homography maps it: the views differ too much there. With 0.1, not enough points of a post
-that covers 7 % of a synthetic view are tracked to show that it stands before the wall."""
+"""A tentative match is not tracked if its second point is farther than this fraction of the longer
+side from where the homography maps its first: the views differ too much there. If a post before a
+wall covers 7 % of synthetic views, 0.1 leaves too few tracks on it to show that it is nearer."""
 
 ALIGNMENT, BLUR_PX = Alignment(radius_px=7, max_shift_px=2.0, convergence_px=0.02, cubic=False), 0.8
 """Tracks are refined by aligning a patch of the first image, after a blur of both. On planes of

@@ -164,7 +164,7 @@ class Evidence:
 
     @property
     def is_chance(self) -> bool:
-        """Whether many cells are compared, and chance explains over half of the explained ones."""
+        """Whether many cells are compared, and chance would explain half as many as explained."""
         compared = np.count_nonzero(np.isfinite(self.similarity)) / WINDOW_CELLS
         return bool(compared > MIN_WINDOWS / MIN_SHARE and self.share < 2 * FALSE_POSITIVE_RATE)
 

@@ -140,7 +140,7 @@ class Sources:
 
     @cached_property
     def learned(self) -> Tentative:
-        """Matches of learned points in copies whose longer side is `LEARNED_SIDE_PX`."""
+        """Matches by learned descriptors in images reduced to the longer side `LEARNED_SIDE_PX`."""
         return self._matched(self._extract(LEARNED_SIDE_PX, LEARNED_KEYPOINTS), LEARNED_SIDE_PX)
 
     def _extract(self, side_px: int, keypoints: int) -> tuple[Keypoints, Keypoints]:

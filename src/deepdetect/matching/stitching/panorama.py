@@ -65,7 +65,7 @@ class Panorama:
         valid: (H, W) bool, true where an image is.
         homographies: (3, 3) homographies by image number, in the order in which images were
             connected. For a flat panorama they map to `image`, otherwise to the reference image.
-        reference: number of the undistorted image, or of the middle one of a curved panorama.
+        reference: index of the unwarped image, or of the middle one of a curved panorama.
         unregistered: by image number, the reason why an image is not in the panorama.
         matches: number of dense matches of each registered pair.
         residual_px: RMS difference between each pair's own homography and the panorama's, at
@@ -126,7 +126,7 @@ def stitch(
     options: StitchingOptions = StitchingOptions(),
     progress: Callable[[str], object] | None = None,
 ) -> Panorama:
-    """Stitch images taken from one place, or of a plane, to a panorama.
+    """Stitch images taken from one place, or of a plane, into a panorama.
 
     Pairs are registered by guided matching at reduced size, and all homographies are refined
     jointly. The brightness of the images is equalised, and they are blended on one canvas along
@@ -143,8 +143,8 @@ def stitch(
         projection: "plane" keeps lines straight; "cylindrical" and "spherical" need cameras that
             only rotated, and level the horizon.
         crop: crop the panorama to the largest rectangle without black areas.
-        reference: number of the undistorted image of a flat panorama, or of the middle image of a
-            curved one; None chooses the image that distorts the others least.
+        reference: index of the image that a flat panorama leaves unwarped, or of the middle image
+            of a curved one; None chooses the image that warps the others least.
         force: make the panorama even if its pairs contradict each other; a warning then says so.
         seed: seed of all random choices.
         options: scale, size limit and registration size of the panorama.

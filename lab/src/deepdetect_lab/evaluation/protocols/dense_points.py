@@ -212,7 +212,7 @@ def _sgbm_points(
             (rgb0, rgb1), matrices, (turn0, turn1), (first, second), strict=True
         )
     ]
-    # OpenCV rectifies cameras above each other so that matches share a column instead of a row.
+    # If one camera is above the other, rectified views have matches in one column, not in one row.
     axis = int(abs(second[1, 3]) > abs(second[0, 3]))
     if axis:
         views = [np.ascontiguousarray(view.transpose(1, 0, 2)) for view in views]
