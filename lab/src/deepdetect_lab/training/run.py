@@ -124,15 +124,15 @@ def train_on_pairs(
             safetensors and an ONNX file otherwise), MODEL_CARD.md and the training curves.
         options: the recipe.
         init_weights: weights to start from, for a descriptor or a matcher: a safetensors file that
-            a run wrote, or EdgePoint2's L64.pth. None: random, from the seed.
+            a run wrote; for a descriptor also EdgePoint2's L64.pth. None: random, from the seed.
         readings: folder written by `deepdetect dev read-teachers`, for a descriptor with `crops`.
         places: folder of real photographs for a matcher, with the folders `fixed` and `moving`.
             Each has a folder per place, with photographs of a fixed camera, or from several
             viewpoints.
         device: "auto" is CUDA if there is a GPU, else the CPU. Only descriptors can use a GPU.
         num_workers: number of processes that generate pairs; with 0, the training process does it.
-            None: 0, or for a descriptor on a GPU, one less than the number of processors. A match
-            filter always uses all processors.
+            None: 0, or for a descriptor on a GPU, one less than the number of processors. Both
+            matchers always draw on all processors.
         log: function that gets each line of text for the user. None: no text, and no progress bars.
 
     Returns:

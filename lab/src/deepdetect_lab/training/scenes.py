@@ -233,12 +233,15 @@ def draw_layers(
     return layers, scales, abs(angles[1])
 
 
-def draw_until_seen(draw: Callable[[], Drawn | None]) -> Drawn:
+def draw_until_seen(
+    draw: Callable[[], Drawn | None],
+    unseen: str = "the images have too little detail for pairs of views",
+) -> Drawn:
     """Call `draw` until it does not return None; raise an OptionError after `ATTEMPTS` calls."""
     for _ in range(ATTEMPTS):
         if (drawn := draw()) is not None:
             return drawn
-    raise OptionError("the images have too little detail for pairs of views: use other photographs")
+    raise OptionError(f"{unseen}: use other photographs")
 
 
 def _draw_photograph(rng: np.random.Generator, files: Sequence[Path]) -> np.ndarray:

@@ -47,8 +47,8 @@ VECTOR_RATE = 0.4
 Chosen by hand."""
 
 BACKBONE_RATE = 0.5
-"""Factor of the learning rate of the layers that start from EdgePoint2's weights, so that they keep
-more of what EdgePoint2 learned from real pairs. Chosen by hand."""
+"""Factor of the learning rate of the layers that may start from EdgePoint2's weights, so that they
+keep more of what EdgePoint2 learned from real pairs. Chosen by hand."""
 
 NO_KERNELS = "at_half", "by_size", "score"
 """Name prefixes of the layers that Muon does not train."""

@@ -59,6 +59,11 @@ FIXED, MOVING = "fixed", "moving"
 """Folders in the folder of places. Each has a folder per place, with photographs of a fixed camera,
 or from several viewpoints."""
 
+UNSEEN = {
+    FIXED: "fixed cameras need several photographs of one size with detail in both",
+    MOVING: "places need photographs that `match_images` matches with high confidence",
+}
+
 UNCHANGED_SHARE = 0.35
 """Share of the photographs of fixed cameras that keep their viewpoint. Chosen by hand."""
 
@@ -122,9 +127,9 @@ def _write_pair(
         unrelated = number % (2 * UNRELATED) == 0
         pair = draw_until_seen(partial(draw_synthetic, rng, files, unrelated))
     elif number % 4 == 1:
-        pair = draw_until_seen(partial(draw_fixed, rng, _places(places, FIXED)))
+        pair = draw_until_seen(partial(draw_fixed, rng, _places(places, FIXED)), UNSEEN[FIXED])
     else:
-        pair = draw_until_seen(partial(draw_moving, rng, _places(places, MOVING)))
+        pair = draw_until_seen(partial(draw_moving, rng, _places(places, MOVING)), UNSEEN[MOVING])
     arrays = {**pair.inputs, "partners0": pair.partners0, "partners1": pair.partners1}
     save_arrays(folder / f"{seed}-{number:06d}.npz", arrays)
 
@@ -134,6 +139,12 @@ def read_pair(path: Path) -> Pair:
     arrays = load_arrays(path)
     assert arrays is not None
     return Pair(arrays, arrays.pop("partners0"), arrays.pop("partners1"))
+
+
+def files_of_places(folder: Path) -> list[Path]:
+    """Return the photographs of all places; raise an OptionError if a kind of place is missing."""
+    places = [*_places(folder, FIXED), *_places(folder, MOVING)]
+    return [file for place in places for file in find_images(place)]
 
 
 def _places(folder: Path, kind: str) -> list[Path]:
@@ -246,12 +257,14 @@ def labelled(
     """Return a pair, or None if too few keypoints correspond.
 
     For each image, `ends` are the places of its keypoints in the other image, `known` tells where
-    these are right, and `hidden` which keypoints cannot be seen in the other image.
+    these are right, and `hidden` which keypoints cannot be seen in the other image. A hidden one
+    near a keypoint of the other image may have it as a partner all the same.
     """
     partners = [np.full(len(each), UNKNOWN) for each in (first, second)]
     for side, other in enumerate((second, first)):
-        away = KDTree(other.xy).query(np.where(known[side][:, None], ends[side], -1e6))[0]
-        partners[side][(known[side] & (away >= FAR_PX)) | hidden[side]] = NONE
+        told = known[side] | (hidden[side] & np.isfinite(ends[side]).all(1))
+        away = KDTree(other.xy).query(np.where(told[:, None], ends[side], -1e6))[0]
+        partners[side][(known[side] | hidden[side]) & (away >= FAR_PX)] = NONE
     rows0 = np.flatnonzero(known[0])
     away, rows1 = KDTree(second.xy).query(ends[0][rows0])
     mutual = KDTree(ends[0][rows0]).query(second.xy[rows1])[1] == np.arange(len(rows0))
@@ -266,6 +279,8 @@ def labelled(
 def predicted(xy: np.ndarray, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     """Return where dense matches predict (N, 2) positions in the other image; NaN if unknown."""
     ends = np.full((len(xy), 2), np.nan)
+    if len(points0) < AROUND:
+        return ends
     away, near = KDTree(points0).query(xy, AROUND)
     for row in np.flatnonzero(away[:, AROUND // 2 - 1] < AROUND_PX):
         here = np.column_stack([points0[near[row]] - xy[row], np.ones(AROUND)])

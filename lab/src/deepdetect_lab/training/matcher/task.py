@@ -14,16 +14,17 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 from torch.utils.data import DataLoader, Dataset
 
+from deepdetect._shared.records import key
 from deepdetect.features.learned import LENGTH
 
-from ...networks.weights import load_network
+from ...networks.weights import load_network, weights_digest
 from ..match_filter import VALIDATION_SEED
 from ..recipe import MatcherTrainingOptions
 from ..sampler import milestones
 from ..synthetic import happens, rotation
 from ..trainer import Trainer, digests, seeded, with_plateau
 from .network import Matcher, export_matcher
-from .pairs import NONE, UNKNOWN, Pair, draw_pairs, read_pair
+from .pairs import NONE, UNKNOWN, Pair, draw_pairs, files_of_places, read_pair
 
 ONNX = "attention.onnx"
 
@@ -154,16 +155,22 @@ class MatcherTrainer(Trainer):
         quiet: bool = True,
     ) -> None:
         self.options = options
-        pairs = output / "pairs"
-        self.files = draw_pairs(images, places, pairs, options.seed + 2, options.drawn, quiet)
-        held_out = draw_pairs(validation, None, pairs, VALIDATION_SEED, options.val_pairs, quiet)
-        self.held_out = [as_tensors(read_pair(file)) for file in held_out]
         network: Any = (
             seeded(Matcher, options.seed)
             if init_weights is None
             else load_network(init_weights, Matcher)
         )
         self.network = network.train()
+        self.origin = {
+            **digests(images, validation),
+            "initial_weights": weights_digest(self.network)[:16],
+            "places": "" if places is None else key(files_of_places(places))[:16],
+        }
+        # Pairs of other images or places have another folder.
+        pairs = output / "pairs" / key([*self.origin.values()])[:12]
+        self.files = draw_pairs(images, places, pairs, options.seed + 2, options.drawn, quiet)
+        held_out = draw_pairs(validation, None, pairs, VALIDATION_SEED, options.val_pairs, quiet)
+        self.held_out = [as_tensors(read_pair(file)) for file in held_out]
         self.average = copy.deepcopy(self.network).eval()
         reading = ("descriptor.", "adapted.", "traits.")
         named = [*self.network.named_parameters()]
@@ -174,7 +181,6 @@ class MatcherTrainer(Trainer):
         self.optimizers = [torch.optim.AdamW(groups, weight_decay=WEIGHT_DECAY)]
         self.steps = options.steps
         self.milestones = milestones(options.steps, options.val_count)
-        self.origin = digests(images, validation)
         self.notes = {"images": str(len(images)), "pairs": str(len(self.files))}
 
     def loader(self, first: int = 0) -> DataLoader[Any]:
@@ -216,7 +222,7 @@ def measure(
             unrelated.append(len(rows))
             continue
         correct = partners0[rows] == columns[rows]
-        known = (partners0[rows] != UNKNOWN) & (partners1[columns[rows]] != UNKNOWN)
+        known = (partners0[rows] != UNKNOWN) | (partners1[columns[rows]] != UNKNOWN)
         right += int(correct.sum())
         counted += int(known.sum())
         partnered += int((partners0 >= 0).sum())
