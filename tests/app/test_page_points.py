@@ -186,7 +186,7 @@ write([...rows0].flatMap((row0, k) => ratios[k] < RATIO ? [row0, rows1[k]] : [])
     )
     limits = {"ratio": RATIOS["learned"], "mutual": True}
     match = partial(match_descriptors, matcher=exact_neighbours, **limits)
-    expected = match_learned(*features, match)
+    expected, _ = match_learned(*features, match)
     pairs = set(zip(expected.indices0.tolist(), expected.indices1.tolist(), strict=True))
     common = pairs & {tuple(pair) for pair in found.reshape(-1, 2).astype(int).tolist()}
     assert len(common) >= SHARED * max(len(pairs), len(found) / 2) > 200

@@ -34,7 +34,7 @@ def teacher_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]
     torch.manual_seed(5)
     axes = {2: "height", 3: "width"}
     shapes = dict.fromkeys(("image", "descriptors"), axes)
-    model = to_onnx(EdgePoint(), {"image": torch.zeros(1, 1, 64, 96)}, "descriptors", shapes)
+    model = to_onnx(EdgePoint(), {"image": torch.zeros(1, 1, 64, 96)}, ("descriptors",), shapes)
     (folder / "edgepoint.onnx").write_bytes(model.SerializeToString())
     torch.save(Aliked().state_dict(), folder / "aliked.pth")
     return folder / "edgepoint.onnx", folder / "aliked.pth"
