@@ -2,11 +2,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnxruntime
 import pytest
 import torch
 
+from deepdetect import OptionError
 from deepdetect_lab.training import MatcherTrainingOptions
 from deepdetect_lab.training.matcher import task
 from deepdetect_lab.training.matcher.network import OUTPUTS, Matcher, export_matcher
@@ -32,6 +34,15 @@ def made_pair(seed: int, count: int = 60) -> Pair:
     partners0[: count // 3] = NONE
     partners1 = np.where(order < count // 3, NONE, order)
     return Pair(inputs, partners0.astype(np.int16), partners1.astype(np.int16))
+
+
+def places_of(folder: Path) -> Path:
+    """Make a folder of places with a photograph of each kind."""
+    for kind in ("fixed", "moving"):
+        place = folder / "places" / kind / "one"
+        place.mkdir(parents=True)
+        cv2.imwrite(str(place / "0.png"), np.zeros((20, 20), np.uint8))
+    return folder / "places"
 
 
 def test_varied_pairs_have_the_same_partners() -> None:
@@ -62,12 +73,14 @@ def test_it_learns_and_its_file_does_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pairs = {Path(str(seed)): made_pair(seed) for seed in range(12)}
-    monkeypatch.setattr(task, "draw_pairs", lambda *_: [*pairs])
+    monkeypatch.setattr(task, "draw_pairs", lambda *_, **__: [*pairs])
     monkeypatch.setattr(task, "read_pair", lambda path: pairs[path])
     options = MatcherTrainingOptions(steps=60, val_count=2, learning_rate=2e-3)
     trainer = MatcherTrainer([], [], options, tmp_path)
     before = trainer.validate(0)["validation_loss"]
     result = trainer.fit(tmp_path)
+    with pytest.raises(OptionError, match="places"):
+        MatcherTrainer([], [], options, tmp_path, places_of(tmp_path)).fit(tmp_path)
     assert result.best["validation_loss"] < before - 0.5
     inputs, _, _ = as_tensors(made_pair(20))
     with torch.no_grad():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -167,10 +168,9 @@ class MatcherTrainer(Trainer):
             "places": "" if places is None else key(files_of_places(places))[:16],
         }
         # Pairs of other images or places have another folder.
-        pairs = output / "pairs" / key([*self.origin.values()])[:12]
-        self.files = draw_pairs(images, places, pairs, options.seed + 2, options.drawn, quiet)
-        held_out = draw_pairs(validation, None, pairs, VALIDATION_SEED, options.val_pairs, quiet)
-        self.held_out = [as_tensors(read_pair(file)) for file in held_out]
+        folder = output / "pairs" / key([*self.origin.values()])[:12]
+        self._draw = partial(draw_pairs, folder=folder, quiet=quiet)
+        self._images, self._validation, self._places = images, validation, places
         self.average = copy.deepcopy(self.network).eval()
         reading = ("descriptor.", "adapted.", "traits.")
         named = [*self.network.named_parameters()]
@@ -181,7 +181,20 @@ class MatcherTrainer(Trainer):
         self.optimizers = [torch.optim.AdamW(groups, weight_decay=WEIGHT_DECAY)]
         self.steps = options.steps
         self.milestones = milestones(options.steps, options.val_count)
-        self.notes = {"images": str(len(images)), "pairs": str(len(self.files))}
+        self.notes = {"images": str(len(images))}
+
+    @cached_property
+    def files(self) -> list[Path]:
+        """The training pairs, drawn when they are needed first."""
+        options = self.options
+        return self._draw(self._images, self._places, seed=options.seed + 2, count=options.drawn)
+
+    @cached_property
+    def held_out(self) -> list[tuple[dict[str, Tensor], Tensor, Tensor]]:
+        """The validation pairs, drawn when they are needed first."""
+        count = self.options.val_pairs
+        files = self._draw(self._validation, None, seed=VALIDATION_SEED, count=count)
+        return [as_tensors(read_pair(file)) for file in files]
 
     def loader(self, first: int = 0) -> DataLoader[Any]:
         """Return a loader of the batches from step `first` on."""
