@@ -339,37 +339,24 @@ class MatchFilterTrainingOptions:
 
 @suggest_keywords
 @dataclass(frozen=True)
-class MatcherTrainingOptions:
-    """Options for training the matcher.
+class MatcherTrainingOptions(MatchFilterTrainingOptions):
+    """Options for training the matcher: as for the match filter, with other defaults.
 
     Attributes:
         steps: optimiser steps.
         pairs: pairs of images in each step, each varied at random.
         drawn: number of pairs drawn before the first step. All steps take their pairs from them.
         learning_rate: highest learning rate, after the warm-up; it falls linearly to 0.
-        val_count: number of validations, besides one before the first step.
+        val_count: number of validations.
         val_pairs: number of validation pairs.
         seed: seed of the weights and the pairs.
-
-    Raises:
-        OptionError: a value is out of its range.
     """
 
     steps: int = 2000
     pairs: int = 4
     drawn: int = 3000
     learning_rate: float = 3e-4
-    val_count: int = 12
     val_pairs: int = 60
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("learning_rate",),
-            not_negative=("seed",),
-            counts=("steps", "pairs", "drawn", "val_count", "val_pairs"),
-        )
 
 
 _ESPNET = TrainingOptions(
